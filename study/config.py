@@ -1,0 +1,327 @@
+"""Settings of every stage, the paper's numbers with their section, and content keys.
+
+Settings are frozen pydantic models. A profile (`sweeps/profiles/*.yaml`) names the values that differ from the
+defaults here; a sweep file (`sweeps/*.yaml`) names a grid. Section numbers refer to arXiv 2003.00695.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+# --- the paper's networks (Sec. IV-B, IV-C) -------------------------------------------------------------------------
+
+IMAGE = 64  # pixels a side, after the area average from 256 (Sec. IV-A)
+LATENT = 64  # numbers in z
+CHANNELS = (32, 64, 128)  # of the three convolutions; a decoder runs them backwards
+KERNEL, STRIDE = 4, 2
+CORE = 6  # 64 -> 31 -> 14 -> 6 pixels a side, no padding anywhere
+STEERING_HIDDEN = (256, 64)
+ACCELERATION_HIDDEN = (128, 64)
+ACCELERATIONS = (-1.0, 0.5, 1.0)  # class 0, 1, 2: throttle - brake of the autopilot (Sec. IV-C)
+STEERING_CROP = 0.25  # where a command is applied; the loss sees the raw label
+DROPOUT = 0.5
+
+HEADS: dict[str, int] = {"rec": 3, "pred": 1, "plan": 1}  # decoder head -> output channels
+HEAD_SETS: dict[str, tuple[str, ...]] = {
+    "rec": ("rec",),
+    "rec+pred": ("rec", "pred"),
+    "rec+plan": ("rec", "plan"),
+    "full": ("rec", "pred", "plan"),
+}
+
+
+class BadInputError(Exception):
+    """Something a user gave cannot be used. Commands print it and exit with code 2, without a traceback.
+
+    The message says what is wrong, what was given, what is allowed and what to do next.
+    """
+
+
+def one_of(what: str, got: object, allowed: object) -> BadInputError:
+    """Error for a name that is not among the allowed ones."""
+    names = ", ".join(str(name) for name in allowed)  # type: ignore[attr-defined]
+    return BadInputError(f"unknown {what} '{got}'; choose from {names}")
+
+
+class Settings(BaseModel):
+    """Frozen, and no setting that is not known."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+Share = Annotated[float, Field(ge=0, le=1)]
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+Count = Annotated[int, Field(ge=1)]
+
+
+class TownSettings(Settings):
+    """The simulated town and its traffic (Sec. IV-A; ours, in the place of CARLA's Town03)."""
+
+    rows: Annotated[int, Field(ge=2)] = Field(5, description="rows of the street grid")
+    columns: Annotated[int, Field(ge=2)] = Field(5, description="columns of the street grid")
+    block: tuple[Positive, Positive] = Field((60.0, 84.0), description="shortest and longest block [m]")
+    dropped_edges: Annotated[int, Field(ge=0)] = Field(3, description="streets left out of the full grid")
+    two_lane_share: Share = Field(0.4, description="share of streets with two lanes each way")
+    vehicles: Count = Field(100, description="vehicles in the town (Sec. IV-A: 100)")
+    speed_limit: Positive = Field(40.0, description="the town's one speed limit [km/h]")
+    road_limits: tuple[Positive, ...] = Field(
+        (), description="limits to draw for each road [km/h]; empty: one limit everywhere. Drawn into the map layer"
+    )
+    green: Positive = Field(5.0, description="green of one approach [s]")
+    yellow: Positive = Field(1.5, description="yellow [s]")
+    all_red: NotNegative = Field(1.0, description="all approaches red [s]")
+    brake_hold: NotNegative = Field(
+        0.5, description="a brake, once on, is held at least this long [s]; 0 is literal CARLA"
+    )
+
+    @model_validator(mode="after")
+    def _block_in_order(self) -> Self:
+        if self.block[0] > self.block[1]:
+            raise ValueError(f"block: the shortest, {self.block[0]}, is longer than the longest, {self.block[1]}")
+        return self
+
+
+class RecordingSettings(Settings):
+    """How long a drive is watched, and which drives. Each drive has its own town, drawn from its own seed."""
+
+    warm_up: NotNegative = Field(10.0, description="driven before recording starts [s]")
+    duration: Positive = Field(24.0, description="recorded [s], at 10 Hz")
+    encoder_episodes: Annotated[int, Field(ge=2)] = Field(80, description="drives for the encoder set")
+    policy_episodes: Annotated[int, Field(ge=2)] = Field(80, description="other drives, for the policy set (Sec. IV-A)")
+    seed: Annotated[int, Field(ge=0)] = Field(0, description="seed of the first drive")
+
+
+class BirdviewSettings(Settings):
+    """What is painted (Sec. III-A)."""
+
+    view: Positive = Field(40.0, description="side of the square field of view [m] (Sec. III-A)")
+    behind: NotNegative = Field(15.0, description="of which lies behind the ego [m] (Sec. III-A: ego at 20 m, 15 m)")
+    render: Count = Field(256, description="pixels a side before the area average to 64 (Sec. IV-A)")
+    history: Annotated[int, Field(ge=0)] = Field(10, description="past poses at 10 Hz (Sec. III-A)")
+    future: Annotated[int, Field(ge=1)] = Field(10, description="next poses at 10 Hz in the pred and plan masks")
+    light_range: Positive = Field(27.0, description="a light colours the route when its stop line is this near [m]")
+
+
+class FramesSettings(Settings):
+    """Which recorded moments become frames, and how they are split (Sec. IV-A, V; PAPER.md 2.7 to 2.9)."""
+
+    encoder: Annotated[int, Field(ge=10)] = Field(25_000, description="frames of the encoder set, train and test")
+    policy: Annotated[int, Field(ge=10)] = Field(
+        12_500, description="frames of the balanced policy set, train and test"
+    )
+    test_share: Annotated[float, Field(gt=0, lt=1)] = Field(0.2, description="share of test frames (Sec. V)")
+    split: Literal["episode", "frame"] = Field("episode", description="split whole drives, or frames (literal)")
+    unit: Literal["frame", "drive"] = Field("frame", description="data fractions of frames (literal) or of drives")
+    spacing: Positive = Field(1.0, description="least time between two frames of one vehicle [s]")
+    standing_weight: Share = Field(0.3, description="chance that a standing moment is kept for the encoder set")
+    balance: Literal["all", "steering", "none"] = Field("all", description="what the policy set is raked to")
+    near_zero: Share = Field(0.4, description="policy set: share of steering labels within 0.01 of zero")
+    standing: Share = Field(0.08, description="policy set: share of standing vehicles")
+    weight_cap: Positive = Field(20.0, description="largest raking weight, in multiples of the mean weight")
+    seed: Annotated[int, Field(ge=0)] = 0
+
+
+class EncoderSettings(Settings):
+    """Training of an encoder with its heads (Sec. III-B, IV-B)."""
+
+    epochs: Count = Field(15, description="epochs (Sec. IV-B: 200)")
+    batch: Annotated[int, Field(ge=2)] = Field(128, description="batch size (Sec. IV-B: 2048)")
+    lr: Positive = Field(2e-3, description="Adam's learning rate (Sec. IV-B: '5^{-3}', read as 5e-3)")
+    beta: NotNegative = Field(0.0, description="weight of the KL term; above 0 the autoencoder is variational")
+    head_weights: dict[str, NotNegative] = Field(
+        default_factory=lambda: dict.fromkeys(HEADS, 1.0), description="weight of each head's loss (plain sum: 1)"
+    )
+    budget: Literal["epochs", "steps"] = Field(
+        "epochs", description="at a smaller fraction: same epochs (literal) or same steps"
+    )
+    precision: Literal["auto", "fp32", "bf16"] = Field(
+        "auto", description="auto: bf16 autocast where the hardware multiplies bf16 matrices, else fp32"
+    )
+
+    @model_validator(mode="after")
+    def _known_heads(self) -> Self:
+        for head in self.head_weights:
+            if head not in HEADS:
+                raise ValueError(f"head_weights: unknown head '{head}'; choose from {', '.join(HEADS)}")
+        return self
+
+
+class PolicySettings(Settings):
+    """Training of the policies on a frozen encoder's latents (Sec. III-B.3, IV-C)."""
+
+    epochs: Annotated[int, Field(ge=5)] = Field(100, description="epochs (Sec. IV-C: 100)")
+    batch: Annotated[int, Field(ge=2)] = Field(512, description="batch size (Sec. IV-C: 2048)")
+    lr: Positive = Field(5e-4, description="Adam's learning rate (Sec. IV-C: '5^{-4}', read as 5e-4)")
+    normalise: Literal["zscore", "l2", "none"] = Field("zscore", description="how z is normalised (Sec. IV-C)")
+
+
+class StudySettings(Settings):
+    """Every setting of every stage; a profile is one of these."""
+
+    town: TownSettings = TownSettings()
+    recording: RecordingSettings = RecordingSettings()
+    birdview: BirdviewSettings = BirdviewSettings()
+    frames: FramesSettings = FramesSettings()
+    encoder: EncoderSettings = EncoderSettings()
+    policy: PolicySettings = PolicySettings()
+
+
+Fraction = Annotated[float, Field(gt=0, le=1)]
+
+
+class Grid(Settings):
+    """A sweep file: the cells of a study and what is read off them."""
+
+    name: str
+    title: str = Field(description="headline of the report")
+    heads: Annotated[tuple[str, ...], Field(min_length=1)] = Field(description="head sets")
+    fractions: Annotated[tuple[Fraction, ...], Field(min_length=1)] = Field(
+        (1.0,), description="data fractions in (0, 1] (Sec. V-B)"
+    )
+    encoder_seeds: Count = Field(1, description="encoders for each head set and fraction")
+    policy_seeds: Count = Field(15, description="policies on each encoder (Sec. V-A: 15)")
+    baseline: str = Field("rec", description="head set that the others are compared with")
+    claims: tuple[str, ...] = Field((), description="claims of the paper that this sweep tests")
+
+    @model_validator(mode="after")
+    def _known(self) -> Self:
+        for heads in (*self.heads, self.baseline):
+            if heads not in HEAD_SETS:
+                raise ValueError(f"unknown head set '{heads}'; choose from {', '.join(HEAD_SETS)}")
+        for name in ("heads", "fractions"):
+            values = getattr(self, name)
+            if len(set(values)) != len(values):
+                raise ValueError(f"{name}: {list(values)} names one twice")
+        return self
+
+    def cells(self) -> list[Cell]:
+        """The grid's cells, in the order they are worth running: one encoder seed of everything first."""
+        return [
+            Cell(heads=heads, fraction=fraction, encoder_seed=seed)
+            for seed in range(self.encoder_seeds)
+            for fraction in self.fractions
+            for heads in self.heads
+        ]
+
+
+class Cell(Settings):
+    """One point of the grid: an encoder, and the policies on it."""
+
+    heads: str
+    fraction: Fraction = 1.0
+    encoder_seed: Annotated[int, Field(ge=0)] = 0
+
+    @property
+    def label(self) -> str:
+        """Name for people, e.g. `rec+plan 100% e0`."""
+        return f"{self.heads} {self.fraction * 100:g}% e{self.encoder_seed}"
+
+
+# --- keys -----------------------------------------------------------------------------------------------------------
+
+
+def content_key(stage: str, settings: object, inputs: tuple[str, ...], format_version: int) -> str:
+    """Key of a stage's product: 16 hex digits of sha256 over the canonical JSON of all that it is made from."""
+    plain = settings.model_dump(mode="json") if isinstance(settings, BaseModel) else settings
+    text = json.dumps(
+        {"stage": stage, "settings": plain, "inputs": inputs, "format_version": format_version},
+        sort_keys=True,
+        separators=(",", ":"),
+        allow_nan=False,
+    )
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+# --- learnable numbers ----------------------------------------------------------------------------------------------
+
+
+def parameter_counts() -> dict[str, int]:
+    """Learnable numbers of the encoder and of each head, biases and BatchNorm's affine included (Sec. IV-B)."""
+    area, core = KERNEL * KERNEL, CHANNELS[-1] * CORE * CORE
+    convolutions = zip((3, *CHANNELS[:-1]), CHANNELS, strict=True)
+    encoder = sum(i * o * area + o + 2 * o for i, o in convolutions) + core * LATENT + LATENT
+    counts = {"encoder": encoder}
+    widths = CHANNELS[::-1]
+    for head, channels in HEADS.items():
+        fully_connected = LATENT * core + core + 2 * core
+        hidden = sum(i * o * area + o + 2 * o for i, o in itertools.pairwise(widths))
+        counts[head] = fully_connected + hidden + widths[-1] * channels * area + channels
+    return counts
+
+
+# --- files ----------------------------------------------------------------------------------------------------------
+
+SWEEPS = Path("sweeps")
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """A YAML file's mapping. Raises BadInputError when it is missing, broken or no mapping."""
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise BadInputError(f"cannot read {path}: {error.strerror}") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        where = getattr(error, "problem_mark", None)
+        line = f", line {where.line + 1}" if where else ""
+        raise BadInputError(f"{path}{line} is not valid YAML: {getattr(error, 'problem', error)}") from error
+    if not isinstance(content, dict):
+        raise BadInputError(f"{path} holds no settings (a mapping such as 'encoder: {{epochs: 15}}' is needed)")
+    return content
+
+
+def named_files(folder: Path) -> dict[str, Path]:
+    """Name -> path of the YAML files in a folder."""
+    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+
+
+def explain(error: ValidationError, source: str) -> BadInputError:
+    """The clear form of pydantic's complaint."""
+    lines = []
+    for item in error.errors(include_url=False):
+        where = ".".join(str(part) for part in item["loc"])
+        if item["type"] == "extra_forbidden":
+            lines.append(f"unknown setting '{where}'")
+            continue
+        message = item["msg"].removeprefix("Value error, ")
+        got = "" if isinstance(item["input"], dict) else f" (got {item['input']!r})"
+        lines.append(f"{where}: {message}{got}" if where else message)
+    return BadInputError(f"{source}: " + "; ".join(lines))
+
+
+def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    """`base` with the values of `over`, nested mappings merged."""
+    merged = dict(base)
+    for name, value in over.items():
+        below = merged.get(name)
+        merged[name] = merge(below, value) if isinstance(value, dict) and isinstance(below, dict) else value
+    return merged
+
+
+def load_grid(name: str, overrides: dict[str, Any] | None = None, folder: Path = SWEEPS) -> Grid:
+    """The sweep of that name. Raises BadInputError for an unknown sweep or setting."""
+    files = named_files(folder)
+    if name not in files:
+        raise one_of("sweep", name, files or [f"nothing: there are no sweep files in {folder.absolute()}"])
+    try:
+        return Grid.model_validate(merge(read_yaml(files[name]), overrides or {}) | {"name": name})
+    except ValidationError as error:
+        raise explain(error, f"sweep {name}") from error
+
+
+def load_profile(name: str, overrides: dict[str, Any] | None = None, folder: Path = SWEEPS) -> StudySettings:
+    """The profile of that name. Raises BadInputError for an unknown profile or setting."""
+    files = named_files(folder / "profiles")
+    if name not in files:
+        raise one_of("profile", name, files)
+    try:
+        return StudySettings.model_validate(merge(read_yaml(files[name]), overrides or {}))
+    except ValidationError as error:
+        raise explain(error, f"profile {name}") from error

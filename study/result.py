@@ -1,0 +1,130 @@
+"""What a cell leaves behind: a plain value that can be saved, moved between machines and loaded without torch."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save_file
+
+from study.config import BadInputError, Cell, Grid, StudySettings
+
+FORMAT_VERSION = 1
+CURVE_COLUMNS = ("policy_seed", "stage", "split", "epoch", "metric", "value")
+TABLE_COLUMNS = ("sweep", "heads", "fraction", "encoder_seed", *CURVE_COLUMNS)
+NO_SEED = -1  # policy_seed of rows that belong to the encoder
+ARRAYS = ("encoder", "policies", "samples", "predictions")
+
+Arrays = dict[str, NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class CellResult:
+    """One trained encoder and the policies on it. S policy seeds, N test frames of the policy set, K sample frames.
+
+    `curves`: one row per measured point, columns CURVE_COLUMNS; stage "encoder" (metrics loss, loss_rec, loss_pred,
+    loss_plan, loss_kl; policy_seed is NO_SEED) or "policy" (steering_loss, acceleration_accuracy, balanced_accuracy,
+    cross_entropy); split "train" or "test"; epoch counts from 1.
+    `encoder`, `policies`: weights by name; those of the policies have a leading axis S, beside `z_mean`, `z_std` [64].
+    `samples`: test frames of the encoder set: `input` [K, 64, 64, 3] uint8, and for each head `<head>_output` uint8
+    ([K, 64, 64, 3] for rec, [K, 64, 64] else, 255 is one) and `<head>_target` for pred and plan.
+    `predictions`: `acceleration` [S, N] uint8 class and `steering` [S, N] float32 after the last epoch, with
+    `acceleration_label`, `steering_label`, `episode` [N], and `z` [N, 64] float32 (not normalised).
+    `facts`: floor (majority accuracy on test), frames (counts), seconds per stage, peak_bytes, device, precision,
+    threads, versions: whatever a reader needs to judge the numbers.
+    """
+
+    cell: Cell
+    key: str
+    settings: dict[str, Any]
+    curves: pd.DataFrame
+    encoder: Arrays
+    policies: Arrays
+    samples: Arrays
+    predictions: Arrays
+    facts: dict[str, Any]
+
+    def save(self, folder: Path) -> Path:
+        """Write the result as `folder`, whole or not at all."""
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as name:
+            draft = Path(name) / folder.name
+            draft.mkdir()
+            for part in ARRAYS:
+                arrays = {key: np.ascontiguousarray(value) for key, value in getattr(self, part).items()}
+                save_file(arrays, draft / f"{part}.safetensors")
+            self.curves.to_parquet(draft / "curves.parquet", index=False)
+            head = {
+                "format_version": FORMAT_VERSION,
+                "cell": self.cell.model_dump(mode="json"),
+                "key": self.key,
+                "settings": self.settings,
+                "facts": self.facts,
+            }
+            (draft / "cell.json").write_text(json.dumps(head, indent=1), encoding="utf-8")
+            if folder.exists():
+                shutil.rmtree(folder)
+            os.rename(draft, folder)  # noqa: PTH104 - the one atomic step
+        return folder
+
+    @staticmethod
+    def load(folder: Path) -> CellResult:
+        """Read what `save` wrote. Raises BadInputError when it is not whole."""
+        try:
+            head = json.loads((folder / "cell.json").read_text(encoding="utf-8"))
+            if head["format_version"] != FORMAT_VERSION:
+                raise BadInputError(f"{folder}: format {head['format_version']}; this program reads {FORMAT_VERSION}")
+            return CellResult(
+                cell=Cell.model_validate(head["cell"]),
+                key=str(head["key"]),
+                settings=head["settings"],
+                curves=pd.read_parquet(folder / "curves.parquet"),
+                facts=head["facts"],
+                **{part: load_file(folder / f"{part}.safetensors") for part in ARRAYS},
+            )
+        except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
+            raise BadInputError(f"{folder} is no whole cell result: {error}; run the cell again") from error
+
+
+@dataclass(frozen=True)
+class SweepRecord:
+    """A sweep as the tracker knows it: what was planned, what is finished, what failed (key -> reason).
+
+    `provenance`: commit, uncommitted diff, versions, machine; `data`: the frame store's manifest.
+    """
+
+    grid: Grid
+    profile: str
+    settings: StudySettings
+    planned: dict[str, Cell]
+    results: dict[str, CellResult]
+    failed: dict[str, str] = field(default_factory=dict)
+    provenance: dict[str, Any] = field(default_factory=dict)
+    data: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def complete(self) -> bool:
+        """Whether every planned cell is finished."""
+        return set(self.planned) <= set(self.results)
+
+    def table(self) -> pd.DataFrame:
+        """The tidy table: one row per measured point, columns TABLE_COLUMNS, in the order of the plan."""
+        parts = [
+            self.results[key].curves.assign(
+                sweep=self.grid.name, heads=cell.heads, fraction=cell.fraction, encoder_seed=cell.encoder_seed
+            )
+            for key, cell in self.planned.items()
+            if key in self.results
+        ]
+        if not parts:
+            return pd.DataFrame(columns=list(TABLE_COLUMNS))
+        return pd.concat(parts, ignore_index=True)[list(TABLE_COLUMNS)]
