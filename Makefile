@@ -1,0 +1,39 @@
+# All that a fresh machine needs: make, Python 3.11 or later and pip.
+PYTHON ?= python3
+VENV := .venv
+RUN := $(VENV)/bin/python
+ARGS ?=
+
+.PHONY: help heads datasize test format lock
+.DEFAULT_GOAL := help
+
+help: ## this list
+	@sed -n 's/^\([a-z]*\):.*## /\1	/p' Makefile
+
+$(VENV)/.installed: requirements.lock pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(RUN) -m pip install --quiet --requirement requirements.lock
+	$(RUN) -m pip install --quiet --no-deps --editable .
+	touch $@
+
+heads: $(VENV)/.installed ## the main job: effect of different heads, ends in reports/heads.pdf
+	$(RUN) -m study.sweep heads $(ARGS)
+
+datasize: $(VENV)/.installed ## effect of dataset size, ends in reports/datasize.pdf
+	$(RUN) -m study.sweep datasize $(ARGS)
+
+test: $(VENV)/.installed ## lint, types and the whole test suite
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/mypy
+	$(RUN) -m pytest $(ARGS)
+
+format: $(VENV)/.installed ## put the code into its one form
+	$(VENV)/bin/ruff format .
+	$(VENV)/bin/ruff check --fix .
+
+lock: $(VENV)/.installed ## resolve the dependencies anew; torch stays where the lock has it
+	$(VENV)/bin/pip-compile --quiet --strip-extras --no-annotate --no-emit-index-url --no-emit-find-links \
+		--no-emit-trusted-host --extra dev --upgrade --upgrade-package torch==2.13.0 \
+		--output-file requirements.lock pyproject.toml
+	sed -i 's/^\(torch==[0-9.]*\)+.*/\1/' requirements.lock  # the local build's tag is not on any index
