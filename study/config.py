@@ -126,7 +126,7 @@ class FramesSettings(Settings):
     near_zero: Share = Field(0.4, description="policy set: share of steering labels within 0.01 of zero")
     standing: Share = Field(0.08, description="policy set: share of standing vehicles")
     weight_cap: Positive = Field(20.0, description="largest raking weight, in multiples of the mean weight")
-    seed: Annotated[int, Field(ge=0)] = 0
+    seed: Annotated[int, Field(ge=0)] = Field(0, description="seed of the choice of frames and of the split")
 
 
 class EncoderSettings(Settings):
@@ -332,6 +332,8 @@ def explain(error: ValidationError, source: str) -> BadInputError:
     """The clear form of pydantic's complaint."""
     lines = []
     for item in error.errors(include_url=False):
+        if item["type"] == "too_short" and lines:  # follows from the error inside, which is told already
+            continue
         where = ".".join(str(part) for part in item["loc"])
         if item["type"] == "extra_forbidden":
             lines.append(f"unknown setting '{where}'")

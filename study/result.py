@@ -27,6 +27,34 @@ ARRAYS = ("encoder", "policies", "samples", "predictions")
 Arrays = dict[str, NDArray[Any]]
 
 
+class TrainingDivergedError(RuntimeError):
+    """A loss became infinite or no number: the cell has failed, and trying again would not help."""
+
+
+@dataclass(frozen=True)
+class CellJob:
+    """All that a worker needs to know to train a cell.
+
+    `frames` is the frame store's folder; under `scratch` lies what a killed worker goes on from. `device` is "auto" or
+    a torch device; a worker with `slot` k takes the k-th GPU when there are several.
+    """
+
+    cell: Cell
+    key: str
+    settings: StudySettings
+    policy_seeds: int
+    frames: Path
+    scratch: Path
+    device: str = "auto"
+    threads: int = 1
+    slot: int = 0
+
+    @property
+    def result_folder(self) -> Path:
+        """Where the result lies between its end and its commit."""
+        return self.scratch / "cells" / self.key
+
+
 @dataclass(frozen=True)
 class CellResult:
     """One trained encoder and the policies on it. S policy seeds, N test frames of the policy set, K sample frames.

@@ -1,0 +1,144 @@
+"""The main path of one cell: a trained encoder, its latents, the policies on them, one CellResult.
+
+Knows no tracker and no queue. What is trained is kept under `scratch` by key until the cell is committed, so that a
+killed cell goes on where it was.
+"""
+
+from __future__ import annotations
+
+import resource
+import time
+from collections.abc import Callable
+
+import numpy as np
+import pandas as pd
+import torch
+
+from study.autoencoder import encode, train_encoder
+from study.config import BadInputError, cell_key, encoder_key
+from study.frames import Frames, open_frames
+from study.policy import train_policies
+from study.provenance import provenance
+from study.result import NO_SEED, CellJob, CellResult
+
+Log = Callable[[str, int, dict[str, float]], None]
+Progress = Callable[[str, int, int], None]
+
+
+def run_cell(job: CellJob, log: Log, progress: Progress) -> CellResult:
+    """Train the cell's encoder, encode the policy set once, train all policies, and save the result.
+
+    `log(stage, epoch, metrics)` once an epoch with names such as "test/loss_rec"; `progress(stage, done, total)`.
+    Raises BadInputError for settings that cannot be met, TrainingDivergedError for a loss that is not finite.
+    """
+    store = open_frames(job.frames)
+    settings, cell = job.settings, job.cell
+    if cell_key(settings, cell, job.policy_seeds, store.key) != job.key:
+        raise BadInputError(
+            f"{job.frames} is not the frame store that {cell.label} was planned on; plan the sweep again"
+        )
+    device = choose_device(job)
+    torch.set_num_threads(job.threads)
+
+    started = time.perf_counter()
+    encoder = train_encoder(
+        store.encoder,
+        cell.heads,
+        cell.fraction,
+        cell.encoder_seed,
+        settings.encoder,
+        settings.frames,
+        device=device,
+        checkpoint=job.scratch / "encoders" / encoder_key(settings, cell, store.key),
+        log=lambda epoch, metrics: log("encoder", epoch, metrics),
+        progress=lambda done, whole: progress("encoder", done, whole),
+    )
+    trained = time.perf_counter()
+
+    train, test = (_labelled(store.policy, split) for split in ("train", "test"))
+    z_train, z_test = (
+        encode(encoder.weights, store.policy.images, indices, device=device) for indices, _ in (train, test)
+    )
+    encoded = time.perf_counter()
+
+    policies = train_policies(
+        z_train,
+        z_test,
+        train[1],
+        test[1],
+        range(job.policy_seeds),
+        settings.policy,
+        device=device,
+        log=lambda epoch, metrics: log("policy", epoch, metrics),
+        progress=lambda done, whole: progress("policy", done, whole),
+    )
+    ended = time.perf_counter()
+
+    labels = test[1]
+    result = CellResult(
+        cell=cell,
+        key=job.key,
+        settings=settings.model_dump(mode="json") | {"policy_seeds": job.policy_seeds, "frames_key": store.key},
+        curves=pd.concat(
+            [encoder.curves.assign(policy_seed=NO_SEED, stage="encoder"), policies.curves], ignore_index=True
+        ),
+        encoder=encoder.weights,
+        policies=policies.weights,
+        samples=encoder.samples,
+        predictions={
+            "acceleration": policies.acceleration,
+            "steering": policies.steering,
+            "acceleration_label": labels["acceleration"].to_numpy(np.uint8),
+            "steering_label": labels["steering"].to_numpy(np.float32),
+            "episode": labels["episode"].to_numpy(np.int32),
+            "z": z_test,
+        },
+        facts={
+            "floor": float(np.bincount(labels["acceleration"]).max() / len(labels)),
+            "frames": {
+                "encoder_train": encoder.frames,
+                "encoder_test": len(store.encoder.indices("test")),
+                "policy_train": len(train[1]),
+                "policy_test": len(labels),
+            },
+            "seconds": {
+                "encoder": encoder.seconds,
+                "encode": encoded - trained,
+                "policies": ended - encoded,
+                "cell": ended - started,
+            },
+            "peak_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+            "device": device_name(device),
+            "precision": encoder.precision,
+            "threads": job.threads,
+            "provenance": provenance(),
+        },
+    )
+    result.save(job.result_folder)
+    return result
+
+
+def choose_device(job: CellJob) -> str:
+    """The torch device for a job. Raises BadInputError for one that is not there."""
+    gpus = torch.cuda.device_count()
+    if job.device == "auto":
+        return f"cuda:{job.slot % gpus}" if gpus else "cpu"
+    try:
+        device = torch.device(job.device)
+    except RuntimeError as error:
+        raise BadInputError(f"unknown device '{job.device}'; choose from auto, cpu, cuda, cuda:0, ...") from error
+    if device.type == "cuda" and (device.index or 0) >= gpus:
+        raise BadInputError(
+            f"device '{job.device}' is not there: this machine has {gpus} CUDA devices; try --device auto"
+        )
+    return str(device)
+
+
+def device_name(device: str) -> str:
+    """What a reader should know the device as."""
+    return torch.cuda.get_device_name(device) if device.startswith("cuda") else "CPU"
+
+
+def _labelled(frames: Frames, split: str) -> tuple[np.ndarray, pd.DataFrame]:
+    indices = frames.indices(split)
+    return indices, frames.labels.iloc[indices].reset_index(drop=True)

@@ -1,0 +1,78 @@
+"""The data stage: drives from the town (Sec. IV-A), then the frame store that the cells read.
+
+Both products carry their key in their path, so what is there is used again.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+from study.config import BadInputError, StudySettings, frames_key, recording_key
+from study.cost import data_cost, size
+
+DATA = Path("data")
+POLICY_SEED = 1_000_000  # the policy set's drives are numbered from here: never those of the encoder set (Sec. V-A)
+
+Progress = Callable[[str, int, int], None]
+
+
+def frames_folder(settings: StudySettings, root: Path = DATA) -> Path:
+    """Where the frame store of these settings lies, or will lie."""
+    return root / "frames" / frames_key(settings)
+
+
+def prepare(settings: StudySettings, root: Path, processes: int, progress: Progress) -> Path:
+    """The frame store's folder, after recording and rendering whatever is missing.
+
+    `progress(stage, done, total)` with stage "record" (drives) or "render" (frames).
+    Raises BadInputError when the settings cannot be met or the disk is too small.
+    """
+    folder = frames_folder(settings, root)
+    if (folder / "manifest.json").is_file():
+        return folder
+    _check_room(settings, root)
+    # The simulator is imported only here: frames that exist can be studied on a machine without it.
+    from study.frames import build_frames  # noqa: PLC0415
+    from study.sim.record import record_all  # noqa: PLC0415
+
+    recording = settings.recording
+    first, second = recording.seed, recording.seed + POLICY_SEED
+    seeds = [
+        *range(first, first + recording.encoder_episodes),
+        *range(second, second + recording.policy_episodes),
+    ]
+    drives = record_all(
+        settings.town,
+        recording,
+        seeds,
+        root / "episodes" / recording_key(settings),
+        processes,
+        lambda done, whole: progress("record", done, whole),
+    )
+    split = recording.encoder_episodes
+    build_frames(
+        settings.frames,
+        settings.birdview,
+        drives[:split],
+        drives[split:],
+        folder,
+        processes,
+        lambda _, done, whole: progress("render", done, whole),
+    )
+    return folder
+
+
+def _check_room(settings: StudySettings, root: Path) -> None:
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        free = shutil.disk_usage(root).free
+    except OSError as error:
+        raise BadInputError(f"cannot write to {root}: {error.strerror}; name another working folder") from error
+    need = data_cost(settings).bytes
+    if need > free:
+        raise BadInputError(
+            f"{root} has {size(free)} free and the data needs about {size(need)}: "
+            "free some room, or lower --frames.encoder and --recording.encoder_episodes"
+        )

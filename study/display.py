@@ -1,0 +1,134 @@
+"""The live display of a sweep: cells, stage, epoch, time left. Plain lines when the output is no terminal."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Mapping
+from typing import Self
+
+from rich.console import Console
+from rich.live import Live
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+from study.cost import clock
+
+LINE_EVERY = 15.0  # [s] between two plain lines
+STAGES = {"record": "recording drives", "render": "rendering frames", "encoder": "encoder", "policy": "policies"}
+UNITS = {"record": "drive", "render": "frame", "encoder": "epoch", "policy": "epoch"}
+ENCODER_SHARE = 0.8  # of a cell's time, where the two stages are not told apart beforehand
+DATA_KEY = ""
+
+
+class Display:
+    """Shows how far a sweep is. `costs`: expected seconds of each waiting cell; `data_cost`: of the data stage.
+
+    Times left are the expected ones times what the elapsed ones have shown them to be wrong by.
+    """
+
+    def __init__(self, title: str, costs: Mapping[str, float], labels: Mapping[str, str], data_cost: float) -> None:
+        self._title, self._labels = title, labels
+        self._costs = {DATA_KEY: data_cost, **costs}
+        self._shares = dict.fromkeys(self._costs, 0.0)  # of the cell's time, done
+        self._state: dict[str, str] = {}  # of what runs now
+        self._total = len(labels)
+        self._finished = len(labels) - len(costs)
+        self._failed = 0
+        self._began = self._said = time.monotonic()
+        self._resumed: dict[str, float] = {}
+        console = Console(file=sys.stderr)
+        self._live = Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
+
+    def __enter__(self) -> Self:
+        self.say(f"{self._title}: {self._finished} of {self._total} cells finished")
+        if self._live:
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._live:
+            self._live.stop()
+
+    def data(self, stage: str, done: int, whole: int) -> None:
+        """The data stage has come this far."""
+        share = done / max(whole, 1)
+        self._shares[DATA_KEY] = (share + (stage == "render")) / 2
+        self._state[DATA_KEY] = f"{STAGES[stage]} {done:,}/{whole:,}"
+        if stage == "render" and done == whole:
+            self._state.pop(DATA_KEY)
+            self._shares[DATA_KEY] = 1.0
+        self.tick()
+
+    def start(self, key: str) -> None:
+        """A cell starts."""
+        self._shares[key] = 0.0
+        self._state[key] = "starting"
+        self.tick(now=True)
+
+    def progress(self, key: str, stage: str, done: int, whole: int) -> None:
+        """A cell has come this far in a stage."""
+        share = done / max(whole, 1)
+        before, part = (0.0, ENCODER_SHARE) if stage == "encoder" else (ENCODER_SHARE, 1 - ENCODER_SHARE)
+        self._shares[key] = before + part * share
+        self._resumed.setdefault(key, self._shares[key] if done > 1 else 0.0)
+        self._state[key] = f"{STAGES[stage]}, {UNITS[stage]} {done:,}/{whole:,}"
+        self.tick()
+
+    def finish(self, key: str) -> None:
+        """A cell is committed."""
+        self._finished += 1
+        self._end(key, "finished")
+
+    def fail(self, key: str) -> None:
+        """A cell is given up."""
+        self._failed += 1
+        self._end(key, "FAILED")
+
+    def _end(self, key: str, how: str) -> None:
+        self._shares[key] = 1.0
+        self._state.pop(key, None)
+        self.say(f"{self._labels[key]}: {how}; {self._summary()}")
+
+    def say(self, line: str) -> None:
+        """A line that stays."""
+        if self._live and self._live.is_started:
+            self._live.console.print(Text(line))
+        else:
+            print(f"{time.strftime('%H:%M:%S')}  {line}", file=sys.stderr, flush=True)
+        self._said = time.monotonic()
+
+    def left(self) -> float | None:
+        """Seconds left, or None before anything is known."""
+        spent = sum(self._costs[key] * (share - self._resumed.get(key, 0)) for key, share in self._shares.items())
+        open_ = sum(self._costs[key] * (1 - share) for key, share in self._shares.items())
+        elapsed = time.monotonic() - self._began
+        if spent < 1 or elapsed < 1:
+            return None
+        return open_ * elapsed / spent
+
+    def _summary(self) -> str:
+        left = self.left()
+        failed = f", {self._failed} failed" if self._failed else ""
+        return f"cells {self._finished}/{self._total}{failed}" + ("" if left is None else f", about {clock(left)} left")
+
+    def tick(self, *, now: bool = False) -> None:
+        """Draw again; a plain line only now and then."""
+        if self._live and self._live.is_started:
+            self._live.update(self._picture(), refresh=True)
+        elif now or time.monotonic() - self._said > LINE_EVERY:
+            running = "; ".join(f"{self._labels.get(key, 'data')}: {state}" for key, state in self._state.items())
+            self.say(f"{running or 'waiting'}; {self._summary()}")
+
+    def _picture(self) -> Table:
+        table = Table.grid(padding=(0, 2))
+        for key, state in self._state.items():
+            bar = ProgressBar(total=1.0, completed=self._shares[key], width=30)
+            table.add_row(Text(self._labels.get(key, "data")), bar, Text(state))
+        done = ProgressBar(total=sum(self._costs.values()) or 1, completed=self._done(), width=30)
+        table.add_row(Text(self._title, style="bold"), done, Text(self._summary()))
+        return table
+
+    def _done(self) -> float:
+        return sum(self._costs[key] * share for key, share in self._shares.items())

@@ -1,0 +1,244 @@
+"""Run a sweep: plan its cells, make the data, train what is not finished, commit to MLflow, write the report.
+
+python -m study.sweep heads
+python -m study.sweep datasize --profile smoke --dry-run
+"""
+
+from __future__ import annotations
+
+import argparse
+import fcntl
+import json
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from study.command import GRID_OPTIONS, Parser, add_options, grid_overrides, run, study_overrides
+from study.config import (
+    HEADS,
+    SWEEPS,
+    BadInputError,
+    Cell,
+    Grid,
+    StudySettings,
+    cell_key,
+    content_key,
+    frames_key,
+    load_grid,
+    load_profile,
+    named_files,
+    parameter_counts,
+)
+from study.cost import Cost, cell_cost, clock, data_cost, size, total
+from study.data import DATA, frames_folder, prepare
+
+DEFAULT_TRACKING = "sqlite:///mlruns/mlflow.db"
+EXIT_FAILED, EXIT_INTERRUPTED = 1, 130
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A sweep, decided: its settings and the key of each of its cells."""
+
+    grid: Grid
+    profile: str
+    settings: StudySettings
+    cells: dict[str, Cell]
+
+    @property
+    def key(self) -> str:
+        """Key of the plan: the same cells under the same name."""
+        return content_key("plan", {"sweep": self.grid.name, "profile": self.profile}, tuple(self.cells), 1)
+
+
+def make_plan(name: str, profile: str, study: dict[str, Any], grid: dict[str, Any]) -> Plan:
+    """The plan of a sweep file, a profile and what the command line overrides. Raises BadInputError."""
+    settings, loaded = load_profile(profile, study), load_grid(name, grid)
+    frames = frames_key(settings)
+    cells = {cell_key(settings, cell, loaded.policy_seeds, frames): cell for cell in loaded.cells()}
+    return Plan(loaded, profile, settings, cells)
+
+
+# --- the command ----------------------------------------------------------------------------------------------------
+
+
+def parser() -> Parser:
+    """The command line."""
+    made = Parser(
+        prog="study.sweep",
+        usage="python -m study.sweep NAME [--profile P] [--dry-run] [--group.setting VALUE ...]",
+        description="Run a sweep to its report. Finished cells never run again; a killed sweep goes on.",
+        epilog="In brackets: the value where the profile names no other.\nExample: python -m study.sweep heads --profile smoke --heads '[rec,full]' --encoder.epochs 50",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    made.add_argument(
+        "sweep", help=f"name of a sweep file in {SWEEPS}/: {', '.join(named_files(SWEEPS)) or 'none here'}"
+    )
+    made.add_argument(
+        "--profile",
+        default="laptop",
+        help=f"{', '.join(named_files(SWEEPS / 'profiles'))} (default: laptop)",
+    )
+    made.add_argument("--dry-run", action="store_true", help="show what would run, what is done, and what it costs")
+    made.add_argument("--json", action="store_true", help="with --dry-run: one JSON object on stdout")
+    made.add_argument("--workers", type=int, default=1, metavar="N", help="cells trained at a time (default: 1)")
+    made.add_argument("--device", default="auto", help="cpu, cuda, cuda:1, ... (default: cuda where there is one)")
+    made.add_argument("--tracking", default=DEFAULT_TRACKING, metavar="URI", help="MLflow store (default: %(default)s)")
+    made.add_argument("--no-report", action="store_true", help="stop when the cells are finished")
+    add_options(made, Grid, GRID_OPTIONS)
+    add_options(made, StudySettings)
+    return made
+
+
+def main(args: Sequence[str]) -> int:
+    """Run the command and return its exit code."""
+    options = parser().parse(args)
+    plan = make_plan(options.sweep, options.profile, study_overrides(options), grid_overrides(options))
+    if options.json and not options.dry_run:
+        raise BadInputError("--json goes with --dry-run; add --dry-run")
+    if options.workers < 1:
+        raise BadInputError(f"--workers is {options.workers}; it must be 1 or more")
+    if options.dry_run:
+        return dry_run(plan, options.tracking, as_json=options.json)
+    with only_sweep(Path("mlruns") / "sweep.lock"):
+        try:
+            return execute(plan, options)
+        except KeyboardInterrupt:
+            print("\nStopped. Nothing that was finished is lost; the same command goes on.", file=sys.stderr)
+            return EXIT_INTERRUPTED
+
+
+# --- dry run --------------------------------------------------------------------------------------------------------
+
+
+def dry_run(plan: Plan, tracking: str, *, as_json: bool) -> int:
+    """Print the plan, what of it is finished, and what the rest costs."""
+    done = _finished(plan, tracking)
+    costs = [
+        cell_cost(plan.settings, cell, plan.grid.policy_seeds) for key, cell in plan.cells.items() if key not in done
+    ]
+    ready = (frames_folder(plan.settings) / "manifest.json").is_file()
+    data = Cost(0, 0) if ready or not costs else data_cost(plan.settings)
+    whole = total([data, *costs])
+    frames = plan.settings.frames
+    facts = {
+        "sweep": plan.grid.name,
+        "profile": plan.profile,
+        "cells": [
+            {
+                "key": key,
+                "heads": cell.heads,
+                "fraction": cell.fraction,
+                "encoder_seed": cell.encoder_seed,
+                "status": "finished" if key in done else "waiting",
+            }
+            for key, cell in plan.cells.items()
+        ],
+        "policy_seeds": plan.grid.policy_seeds,
+        "parameters": parameter_counts(),
+        "frames": {"encoder": frames.encoder, "policy": frames.policy},
+        "seconds": round(whole.seconds, 1),
+        "bytes": whole.bytes,
+    }
+    if as_json:
+        print(json.dumps(facts))
+        return 0
+    print(f"{plan.grid.name} ({plan.profile}): {plan.grid.title}\n")
+    for key, cell in plan.cells.items():
+        own = cell_cost(plan.settings, cell, plan.grid.policy_seeds)
+        state = "finished" if key in done else f"waiting, about {clock(own.seconds)}"
+        print(f"  {cell.label:<22} {key}  {plan.grid.policy_seeds} policies  {state}")
+    counts = parameter_counts()
+    heads = ", ".join(f"{head} head {counts[head]:,}" for head in HEADS)
+    where = "there already" if ready else f"about {clock(data.seconds)} to record and render"
+    print(f"\nparameters  encoder {counts['encoder']:,}, {heads}")
+    print(f"frames      {frames.encoder:,} for encoders, {frames.policy:,} for policies; {where}")
+    print(f"disk        about {size(whole.bytes)}")
+    print(f"time        about {clock(whole.seconds)} on 2 CPU cores")
+    return 0
+
+
+def _finished(plan: Plan, tracking: str) -> set[str]:
+    # Looking must not create: a store that does not exist has nothing finished, and MLflow need not be loaded.
+    path = tracking.removeprefix("sqlite:///")
+    if path != tracking and not Path(path).is_file():
+        return set()
+    from study.tracking import Tracker  # noqa: PLC0415
+
+    return set(Tracker(tracking).finished(list(plan.cells)))
+
+
+# --- the run --------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def only_sweep(path: Path) -> Iterator[None]:
+    """Hold the lock of this working folder: SQLite as a queue bears one process that asks."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a+") as stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            stream.seek(0)
+            raise BadInputError(
+                f"another sweep runs in this folder (process {stream.read().strip() or 'unknown'}); "
+                "wait for it, or use --workers N there"
+            ) from error
+        stream.seek(0)
+        stream.truncate()
+        stream.write(str(os.getpid()))
+        stream.flush()
+        yield
+
+
+def execute(plan: Plan, options: argparse.Namespace) -> int:
+    """Run what is not finished, then write the report."""
+    # Imported here, so that --help and --dry-run need none of it.
+    from study.display import Display  # noqa: PLC0415
+    from study.grid import Queue  # noqa: PLC0415
+    from study.provenance import provenance  # noqa: PLC0415
+    from study.result import CellJob  # noqa: PLC0415
+    from study.tracking import Tracker  # noqa: PLC0415
+    from study.worker import Workers  # noqa: PLC0415
+
+    tracker = Tracker(options.tracking)
+    waiting = [key for key in plan.cells if key not in tracker.finished(list(plan.cells))]
+    costs = {key: cell_cost(plan.settings, plan.cells[key], plan.grid.policy_seeds).seconds for key in waiting}
+    ready = (frames_folder(plan.settings) / "manifest.json").is_file()
+    with Display(
+        f"{plan.grid.name} ({plan.profile})",
+        costs,
+        {key: cell.label for key, cell in plan.cells.items()},
+        0.0 if ready else data_cost(plan.settings).seconds,
+    ) as display:
+        frames = frames_folder(plan.settings)
+        if waiting:
+            frames = prepare(plan.settings, DATA, os.cpu_count() or 1, display.data)
+        manifest = frames / "manifest.json"
+        data = json.loads(manifest.read_text(encoding="utf-8")) if manifest.is_file() else {}
+        sweep_run = tracker.open_sweep(plan.grid, plan.profile, plan.settings, plan.cells, data, provenance())
+        queue = Queue(f"{plan.grid.name} {plan.profile} {plan.key}", plan.cells)
+        queue.plan(waiting)
+        jobs = {
+            key: CellJob(plan.cells[key], key, plan.settings, plan.grid.policy_seeds, frames, DATA, options.device)
+            for key in waiting
+        }
+        with Workers(jobs, options.workers, tracker, sweep_run, queue, display) as workers:
+            failed = workers.run()
+        tracker.close_sweep(sweep_run, "FAILED" if failed else "FINISHED")
+        if not options.no_report:
+            display.say("writing the report")
+            from study.report import publish  # noqa: PLC0415
+
+            display.say(f"report: {publish(tracker, plan.grid.name, plan.profile, Path('reports'))}")
+    for key, reason in failed.items():
+        print(f"failed: {plan.cells[key].label} ({key}): {reason.strip()}", file=sys.stderr)
+    return EXIT_FAILED if failed else 0
+
+
+if __name__ == "__main__":
+    run(main)
