@@ -330,7 +330,7 @@ def named_files(folder: Path) -> dict[str, Path]:
 
 def explain(error: ValidationError, source: str) -> BadInputError:
     """The clear form of pydantic's complaint."""
-    lines = []
+    lines: list[str] = []
     for item in error.errors(include_url=False):
         if item["type"] == "too_short" and lines:  # follows from the error inside, which is told already
             continue

@@ -72,7 +72,8 @@ def parser() -> Parser:
         prog="study.sweep",
         usage="python -m study.sweep NAME [--profile P] [--dry-run] [--group.setting VALUE ...]",
         description="Run a sweep to its report. Finished cells never run again; a killed sweep goes on.",
-        epilog="In brackets: the value where the profile names no other.\nExample: python -m study.sweep heads --profile smoke --heads '[rec,full]' --encoder.epochs 50",
+        epilog="In brackets: the value where the profile names no other.\n"
+        "Example: python -m study.sweep heads --profile smoke --heads '[rec,full]' --encoder.epochs 50",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     made.add_argument(

@@ -1,0 +1,154 @@
+"""Settings refuse what they do not know; keys change exactly with what they stand for."""
+
+import itertools
+
+import pytest
+
+from study.config import (
+    HEAD_SETS,
+    BadInputError,
+    Cell,
+    StudySettings,
+    cell_key,
+    encoder_key,
+    frames_key,
+    load_grid,
+    load_profile,
+    parameter_counts,
+    recording_key,
+)
+
+
+def changed(**groups):
+    return StudySettings.model_validate(groups)
+
+
+def test_parameter_counts_are_the_papers():
+    assert parameter_counts() == {"encoder": 461_024, "rec": 474_403, "pred": 473_377, "plan": 473_377}
+
+
+@pytest.mark.parametrize("profile", ["smoke", "laptop", "paper"])
+def test_every_profile_loads(profile):
+    assert load_profile(profile).encoder.epochs >= 1
+
+
+def test_the_paper_profile_has_the_papers_numbers():
+    paper = load_profile("paper")
+    assert (paper.frames.encoder, paper.frames.policy) == (500_000, 80_000)
+    assert (paper.encoder.batch, paper.encoder.epochs, paper.encoder.lr) == (2048, 200, 5e-3)
+    assert (paper.policy.batch, paper.policy.epochs, paper.policy.lr) == (2048, 100, 5e-4)
+
+
+def test_heads_sweep_covers_all_head_sets():
+    assert load_grid("heads").heads == tuple(HEAD_SETS)
+
+
+def test_datasize_shares_its_full_data_cells_with_heads():
+    settings = load_profile("laptop")
+    keys = [
+        {cell_key(settings, cell, grid.policy_seeds, frames_key(settings)) for cell in grid.cells()}
+        for grid in (load_grid("heads"), load_grid("datasize"))
+    ]
+    assert len(keys[0] & keys[1]) == 2
+
+
+def test_encoder_seeds_multiply_the_cells():
+    assert len(load_grid("heads", {"encoder_seeds": 3}).cells()) == 3 * len(load_grid("heads").cells())
+
+
+def test_keys_tell_all_cells_of_a_grid_apart():
+    settings = load_profile("laptop")
+    cells = load_grid("datasize", {"encoder_seeds": 2}).cells()
+    assert len({cell_key(settings, cell, 15, "frames") for cell in cells}) == len(cells)
+
+
+def test_a_key_does_not_depend_on_the_order_of_settings():
+    one = changed(encoder={"epochs": 3, "batch": 8})
+    other = changed(encoder={"batch": 8, "epochs": 3})
+    assert encoder_key(one, Cell(heads="rec"), "f") == encoder_key(other, Cell(heads="rec"), "f")
+
+
+def test_a_new_render_spec_keeps_the_drives_and_changes_the_frames():
+    one, other = StudySettings(), changed(birdview={"light_range": 20})
+    assert recording_key(one) == recording_key(other)
+    assert frames_key(one) != frames_key(other)
+
+
+def test_more_drives_keep_the_drives_there_are():
+    assert recording_key(StudySettings()) == recording_key(changed(recording={"encoder_episodes": 99}))
+
+
+def test_policy_settings_leave_the_encoder_as_it_is():
+    cell, one, other = Cell(heads="full"), StudySettings(), changed(policy={"lr": 0.1})
+    assert encoder_key(one, cell, "f") == encoder_key(other, cell, "f")
+    assert cell_key(one, cell, 15, "f") != cell_key(other, cell, 15, "f")
+
+
+def test_the_weight_of_an_absent_head_changes_nothing():
+    one, other = StudySettings(), changed(encoder={"head_weights": {"rec": 1, "pred": 5, "plan": 1}})
+    assert encoder_key(one, Cell(heads="rec"), "f") == encoder_key(other, Cell(heads="rec"), "f")
+    assert encoder_key(one, Cell(heads="full"), "f") != encoder_key(other, Cell(heads="full"), "f")
+
+
+def test_the_budget_matters_below_the_full_data_only():
+    one, other = StudySettings(), changed(encoder={"budget": "steps"})
+    keys = [
+        {encoder_key(settings, Cell(heads="rec", fraction=fraction), "f") for settings in (one, other)}
+        for fraction in (1.0, 0.5)
+    ]
+    assert [len(found) for found in keys] == [1, 2]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        ({"heads": ["rec+plam"]}, ["rec+plam", "rec+plan"]),
+        ({"fractions": [0]}, ["fractions", "0"]),
+        ({"fractions": [1.5]}, ["fractions", "1.5"]),
+        ({"heads": ["rec", "rec"]}, ["twice"]),
+        ({"policy_seeds": 0}, ["policy_seeds"]),
+        ({"colour": "red"}, ["unknown setting", "colour"]),
+    ],
+)
+def test_a_wrong_grid_is_explained(overrides, words):
+    with pytest.raises(BadInputError) as caught:
+        load_grid("heads", overrides)
+    assert all(word in str(caught.value) for word in words)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        ({"encoder": {"epochs": "many"}}, ["encoder.epochs", "many"]),
+        ({"encoder": {"epohcs": 3}}, ["unknown setting", "encoder.epohcs"]),
+        ({"frames": {"split": "town"}}, ["frames.split", "episode", "town"]),
+        ({"encoder": {"head_weights": {"depth": 1}}}, ["depth", "rec, pred, plan"]),
+        ({"town": {"block": [90, 60]}}, ["block"]),
+    ],
+)
+def test_wrong_settings_are_explained(overrides, words):
+    with pytest.raises(BadInputError) as caught:
+        load_profile("smoke", overrides)
+    assert all(word in str(caught.value) for word in words)
+
+
+def test_unknown_names_list_the_known_ones():
+    with pytest.raises(BadInputError, match="choose from datasize, heads"):
+        load_grid("head")
+    with pytest.raises(BadInputError, match="choose from laptop, paper, smoke"):
+        load_profile("desktop")
+
+
+@pytest.mark.parametrize("text", ["heads: [rec", "- a\n- b", "\x00", "just words"])
+def test_a_broken_sweep_file_is_named(tmp_path, text):
+    (tmp_path / "own.yaml").write_text(text)
+    with pytest.raises(BadInputError, match=r"own\.yaml"):
+        load_grid("own", folder=tmp_path)
+
+
+def test_labels_tell_cells_apart():
+    labels = [
+        Cell(heads=heads, fraction=fraction, encoder_seed=seed).label
+        for heads, fraction, seed in itertools.product(HEAD_SETS, (1.0, 0.0625), (0, 1))
+    ]
+    assert len(set(labels)) == len(labels)

@@ -1,0 +1,76 @@
+"""Imports go one way, and every heavy dependency has one owner (README, "The tree")."""
+
+import ast
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+LAYERS = [
+    {"config"},
+    {"episode", "result", "cost", "command", "provenance"},
+    {"birdview", "sim"},
+    {"frames"},
+    {"autoencoder", "policy", "stats"},
+    {"cell"},
+    {"tracking", "grid", "figures", "display"},
+    {"data", "report", "worker"},
+    {"sweep"},
+]
+OWNERS = {
+    "pydantic": {"config", "command"},
+    "yaml": {"config", "command"},
+    "highway_env": {"sim"},
+    "gymnasium": {"sim"},
+    "cv2": {"birdview"},
+    "lightning": {"autoencoder", "policy"},
+    "mlflow": {"tracking"},
+    "optuna": {"grid"},
+    "scipy": {"stats"},
+    "matplotlib": {"figures"},
+    "typst": {"report"},
+    "rich": {"display"},
+    "argparse": {"command", "sweep", "report", "data"},
+}
+
+
+def modules():
+    """Module name (the package `sim` counts as one) -> the names that its files import."""
+    found: dict[str, set[str]] = {}
+    for path in sorted((ROOT / "study").rglob("*.py")):
+        parts = path.relative_to(ROOT / "study").with_suffix("").parts
+        if parts == ("__init__",):
+            continue
+        names = found.setdefault(parts[0], set())
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                names |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                names.add(node.module)
+    return found
+
+
+def layer(module):
+    return next(depth for depth, names in enumerate(LAYERS) if module in names)
+
+
+def test_every_module_has_a_layer():
+    assert set(modules()) == set().union(*LAYERS)
+
+
+def test_modules_import_from_lower_layers_only():
+    wrong = []
+    for module, names in modules().items():
+        for name in names:
+            parts = name.split(".")
+            if parts[0] == "study" and len(parts) > 1 and parts[1] != module and layer(parts[1]) >= layer(module):
+                wrong.append(f"{module} imports {parts[1]}")
+    assert wrong == []
+
+
+def test_heavy_dependencies_have_one_owner():
+    wrong = [
+        f"{module} imports {name}"
+        for module, names in modules().items()
+        for name in {name.split(".")[0] for name in names}
+        if module not in OWNERS.get(name, {module})
+    ]
+    assert wrong == []
