@@ -1,0 +1,384 @@
+"""Bird view: an Episode's moments as images and masks (Sec. III-A). Reads Episodes only, never the simulator.
+
+Layers, in paint order: map (drivable surface, road boundary, lane lines), the planned way ahead (green, or red by the
+light that governs it), other vehicles' past and present poses (yellow), the ego's (blue). Everything is painted with
+hard edges at `settings.render` pixels a side, as indices into a palette, and area-averaged to 64.
+
+The map does not change during a drive, so it is painted once for the whole Episode; a frame cuts its window out of
+that picture and paints the moving things into it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from study.config import IMAGE, BadInputError, BirdviewSettings
+from study.episode import GREEN, Episode, Lane
+
+FORMAT_VERSION = 1  # raise it when the same Episode and settings give other pixels
+
+RATE_HZ = 10.0  # of history and future (Sec. III-A)
+MASK_BYTES = IMAGE * IMAGE // 8
+
+SURFACE = (32, 4)  # grey of a lane: the first, and how much lighter for each LIMIT_STEP of its speed limit
+PLAIN_SURFACE = 80  # grey where all lanes have one limit
+LIMIT_STEP, LIMIT_SHADES = 5 / 3.6, 32  # [m/s]
+BOUNDARY, LINE = 176, 255  # greys of curbs and of lane lines
+BOUNDARY_WIDTH, LINE_WIDTH, ROUTE_WIDTH = 0.5, 0.3, 2.0  # [m]
+DASH = 3.0  # [m], length of a dash and of the gap behind it
+ROUTE_POINTS = 2.0  # [m] apart: 0.1 m off on the tightest turn of a car
+
+MAP_BYTES = 1 << 26  # a larger map (1.3 km a side at 6.4 pixels per metre) is painted anew for every frame
+MAP_SIDE = 32_000  # cv2 addresses the pixels of a picture it cuts from with 16 bits
+CHUNK = 64  # moments whose geometry is computed together
+
+_PLAIN, _BOUNDARY, _LINE = 1 + LIMIT_SHADES, 2 + LIMIT_SHADES, 3 + LIMIT_SHADES  # palette; 0 is beside the road
+_GREEN, _RED, _OTHERS = 4 + LIMIT_SHADES, 5 + LIMIT_SHADES, 6 + LIMIT_SHADES  # others' oldest pose, then younger ones
+_MASK = 240  # of a set pixel: averages of sixteen such are whole numbers
+_SHIFT = 4  # fractional bits of the coordinates given to cv2
+
+Image = NDArray[np.uint8]
+Moments = NDArray[np.int64]
+Floats = NDArray[np.float64]
+
+
+def render_birdview(
+    episode: Episode, step: int, agent_index: int, settings: BirdviewSettings
+) -> tuple[Image, NDArray[np.bool_], NDArray[np.bool_]]:
+    """One moment as (image [64, 64, 3] uint8 RGB, pred [64, 64] bool, plan [64, 64] bool), see `Renderer.render`."""
+    images, masks = Renderer(episode, settings).render(np.array([[step, agent_index]]))
+    pred, plan = np.unpackbits(masks[0], axis=1).reshape(2, IMAGE, IMAGE).astype(bool)
+    return images[0], pred, plan
+
+
+def check_rate(episode: Episode) -> None:
+    """Raise BadInputError for an Episode that is not at 10 Hz, the rate of history and future (Sec. III-A)."""
+    if episode.rate_hz != RATE_HZ:
+        raise BadInputError(
+            f"Episode {episode.id} has {episode.rate_hz:g} steps per second; bird views need {RATE_HZ:g}: "
+            "resample it with 'python -m study.data import'"
+        )
+
+
+def valid_moments(episode: Episode, settings: BirdviewSettings) -> Moments:
+    """Moments (step, agent index) [M, 2] int64 that may become frames, sorted.
+
+    The agent may be ego, is there during all of its history and future, and its steering and acceleration are known.
+    """
+    check_rate(episode)
+    before, after = settings.history, settings.future
+    there = np.pad(episode.present.cumsum(axis=0, dtype=np.int64), ((1, 0), (0, 0)))
+    span = before + after + 1
+    good = np.zeros_like(episode.present)
+    if episode.steps >= span:
+        good[before : episode.steps - after] = there[span:] - there[:-span] == span
+    good &= np.array([agent.ego for agent in episode.agents], bool)
+    good &= np.isfinite(episode.steering) & np.isfinite(episode.acceleration)
+    return np.argwhere(good).astype(np.int64, copy=False)
+
+
+def governing_light(episode: Episode, settings: BirdviewSettings, moments: Moments) -> NDArray[np.uint8]:
+    """State [M] uint8 of the light that governs each moment's ego: GREEN where there is none within `light_range`."""
+    steps, agents = moments[:, 0], moments[:, 1]
+    light = episode.light[steps, agents]
+    near = (light >= 0) & (episode.light_distance[steps, agents] <= settings.light_range)  # an unknown distance is not
+    state = np.full(len(moments), GREEN, np.uint8)
+    state[near] = episode.light_state[steps[near], light[near]]
+    return state
+
+
+@dataclass(frozen=True)
+class _Window:
+    """Where the field of view lies around the ego: pixels per metre, ego's column and row in pixels."""
+
+    scale: float
+    column: float
+    row: float
+
+    def affine(self, x: float, y: float, heading: float) -> Floats:
+        """World [m] -> pixel centres [2, 3], heading up; left of the ego is left in the picture."""
+        forward, left = (np.cos(heading), np.sin(heading)), (-np.sin(heading), np.cos(heading))
+        turn = -self.scale * np.array([left, forward])
+        at = np.array([self.column, self.row]) - 0.5 - turn @ (x, y)
+        return np.column_stack([turn, at])
+
+
+class Renderer:
+    """Paints moments of one Episode; holds the Episode's painted map.
+
+    Raises BadInputError when the Episode is not at 10 Hz.
+    """
+
+    def __init__(self, episode: Episode, settings: BirdviewSettings) -> None:
+        check_rate(episode)
+        self.episode = episode
+        self.settings = settings
+        self._palette = _palette(settings.history)
+        scale = settings.render / settings.view
+        self._window = _Window(scale, settings.render / 2, (settings.view - settings.behind) * scale)
+        self._sizes = np.array([(agent.length, agent.width) for agent in episode.agents]).reshape(-1, 2)
+        self._map = _Map(episode.lanes, scale, settings.render)
+        self._routes = [
+            (np.concatenate([[0.0], np.hypot(*np.diff(route, axis=0).T).cumsum()]), *route.T.astype(np.float64))
+            if len(route) > 1
+            else None
+            for route in episode.routes
+        ]
+        corner = np.hypot(settings.view / 2, max(settings.behind, settings.view - settings.behind))
+        self._route_ahead = np.arange(0, 1.5 * corner, ROUTE_POINTS)
+
+    def render(self, moments: NDArray[np.integer[Any]]) -> tuple[Image, Image]:
+        """Paint moments [M, 2] of (step, agent index): images [M, 64, 64, 3] uint8 RGB, masks [M, 2, 512] uint8.
+
+        The masks are pred (the other vehicles) and plan (the ego): the union of oriented boxes at the next
+        `settings.future` poses in the present ego frame, set where at least half of a pixel is covered, 4096 bits in
+        row-major order packed by `np.packbits`. Poses outside the recorded steps are not painted.
+        Raises BadInputError when a moment's agent is not there.
+        """
+        moments = np.asarray(moments, np.int64).reshape(-1, 2)
+        self._check(moments)
+        images = np.empty((len(moments), IMAGE, IMAGE, 3), np.uint8)
+        masks = np.empty((len(moments), 2, MASK_BYTES), np.uint8)
+        threads = cv2.getNumThreads()
+        cv2.setNumThreads(1)  # frames are too small to share; processes are what we spread them over
+        try:
+            for start in range(0, len(moments), CHUNK):
+                part = slice(start, start + CHUNK)
+                self._render(moments[part], images[part], masks[part])
+        finally:
+            cv2.setNumThreads(threads)
+        return images, masks
+
+    def _check(self, moments: Moments) -> None:
+        steps, agents = self.episode.present.shape
+        for step, agent in moments.tolist():
+            if not (0 <= step < steps and 0 <= agent < agents and self.episode.present[step, agent]):
+                raise BadInputError(
+                    f"Episode {self.episode.id}: no agent with index {agent} at step {step}; "
+                    f"it has {agents} agents and {steps} steps"
+                )
+
+    def _render(self, moments: Moments, images: Image, masks: Image) -> None:
+        size, palette = self.settings.render, self._palette
+        boxes, colours, ends = self._boxes(moments)
+        states = governing_light(self.episode, self.settings, moments)
+        canvas, flat = np.empty((size, size), np.uint8), np.empty((size, size), np.uint8)
+        grey = np.empty((len(moments), 2, IMAGE, IMAGE), np.uint8)
+        start = 0
+        for index, (step, ego) in enumerate(moments):
+            where = (self.episode.x[step, ego], self.episode.y[step, ego], self.episode.heading[step, ego])
+            affine = self._window.affine(*map(float, where))
+            self._map.paint(canvas, affine)
+            self._paint_route(canvas, affine, int(ego), float(self.episode.route_s[step, ego]), int(states[index]))
+            seen, pred, plan = ends[index]
+            for box, colour in zip(boxes[start:seen], colours[start:seen], strict=True):
+                cv2.fillConvexPoly(canvas, box, colour, cv2.LINE_8, _SHIFT)
+            channels = [_shrink(cv2.LUT(canvas, palette[:, channel], dst=flat)) for channel in range(3)]
+            cv2.merge(channels, dst=images[index])
+            for mask, covering in enumerate((boxes[seen:pred], boxes[pred:plan])):
+                flat.fill(0)
+                for box in covering:
+                    cv2.fillConvexPoly(flat, box, _MASK, cv2.LINE_8, _SHIFT)
+                grey[index, mask] = _shrink(flat)
+            start = plan
+        masks[:] = np.packbits((grey >= _MASK // 2).reshape(len(moments), 2, -1), axis=2)
+
+    def _boxes(self, moments: Moments) -> tuple[list[NDArray[np.int32]], list[int], list[list[int]]]:
+        """Boxes in paint order, frame by frame, with palette indices; for each frame the ends of its three parts.
+
+        The parts are past and present poses, the others' next poses, the ego's next poses.
+        """
+        episode, history, window = self.episode, self.settings.history, self._window
+        offsets = np.arange(-history, self.settings.future + 1)
+        steps, egos = moments[:, :1] + offsets, moments[:, 1]
+        inside = (steps >= 0) & (steps < episode.steps)
+        steps = steps.clip(0, episode.steps - 1)
+        now = (moments[:, 0], egos)
+        # Cull in float32 relative to the centre of the view: cheap, and a metre of margin covers its rounding.
+        heading = episode.heading[now].astype(np.float64)
+        forward = np.stack([np.cos(heading), np.sin(heading)], axis=1)
+        place = np.stack([episode.x[now], episode.y[now]], axis=1).astype(np.float64)
+        ahead = self.settings.view / 2 - self.settings.behind
+        middle = (place + ahead * forward).astype(np.float32)
+        east = episode.x[steps] - middle[:, 0, None, None]
+        north = episode.y[steps] - middle[:, 1, None, None]
+        reach = np.float32(np.hypot(*self._sizes.T).max(initial=0) / 2 + 1)
+        near = (
+            east * east + north * north < (np.float32(self.settings.view) * np.float32(0.5**0.5) + reach) ** 2
+        )  # NaN is never near
+        near &= episode.present[steps] & inside[..., None]
+        frame, pose, agent = np.nonzero(near)
+        step = steps[frame, pose]
+
+        east = episode.x[step, agent] - place[frame, 0]
+        north = episode.y[step, agent] - place[frame, 1]
+        fx, fy = forward[frame].T
+        column = window.column - window.scale * (fx * north - fy * east)
+        row = window.row - window.scale * (fx * east + fy * north)
+        margin, size = reach * window.scale, self.settings.render
+        seen = (column > -margin) & (column < size + margin) & (row > -margin) & (row < size + margin)
+        frame, pose, agent, step, column, row = (v[seen] for v in (frame, pose, agent, step, column, row))
+
+        turn = episode.heading[step, agent] - heading[frame]
+        # cv2 fills a pixel whose centre lies up to half a pixel outside: boxes are made that much smaller.
+        half = self._sizes[agent] * (window.scale / 2) - 0.5
+        along = np.stack([-np.sin(turn), -np.cos(turn)], axis=1) * half[:, :1]
+        across = np.stack([-np.cos(turn), np.sin(turn)], axis=1) * half[:, 1:]
+        centre = np.stack([column, row], axis=1) - 0.5
+        corners = np.stack([centre + along + across, centre + along - across, centre - along - across], axis=1)
+        corners = np.concatenate([corners, (centre - along + across)[:, None]], axis=1)
+        fixed = np.rint(corners * (1 << _SHIFT)).astype(np.int32)
+
+        # A pose that stands where the next younger one stands is painted over by it: leave it out.
+        at = np.full((len(moments), len(offsets) + 1, near.shape[2]), -1)
+        at[frame, pose, agent] = np.arange(len(frame))
+        younger = at[frame, pose + 1, agent]
+        hidden = (younger >= 0) & (fixed == fixed[younger]).all(axis=(1, 2)) & (pose != history)
+        past = pose <= history
+        own = agent == egos[frame]
+        layer = np.where(past, own * 1, own * 1 + 2)  # others' past, ego's past, pred, plan
+        order = np.lexsort((pose, layer, frame))
+        order = order[~hidden[order]]
+        colour = _OTHERS + pose + own * (history + 1)
+        part = (frame * 3 + np.maximum(layer - 1, 0))[order]
+        ends = np.searchsorted(part, np.arange(len(moments) * 3), side="right").reshape(-1, 3)
+        return list(fixed[order]), colour[order].tolist(), ends.tolist()
+
+    def _paint_route(self, canvas: Image, affine: Floats, ego: int, progress: float, light: int) -> None:
+        route = self._routes[ego]
+        if route is None or not np.isfinite(progress):
+            return
+        length, x, y = route
+        along = progress + self._route_ahead
+        along = along[: np.searchsorted(along, length[-1]) + 1]
+        way = np.stack([np.interp(along, length, x), np.interp(along, length, y)], axis=1)
+        width = max(1, round(ROUTE_WIDTH * self._window.scale))
+        colour = _GREEN if light == GREEN else _RED  # yellow counts as red
+        cv2.polylines(canvas, [_fixed(way, affine)], False, colour, width, cv2.LINE_8, _SHIFT)  # noqa: FBT003
+
+
+def _palette(history: int) -> Image:
+    """Colours [256, 3] RGB by palette index. Past poses fade to black, linear in their age."""
+    if _OTHERS + 2 * (history + 1) > 256:
+        raise BadInputError(f"birdview.history: at most {(256 - _OTHERS) // 2 - 1} past poses, got {history}")
+    colours = np.zeros((256, 3), np.uint8)
+    first, step = SURFACE
+    colours[1 : 1 + LIMIT_SHADES] = (first + step * np.arange(LIMIT_SHADES))[:, None]
+    colours[[_PLAIN, _BOUNDARY, _LINE]] = np.array([[PLAIN_SURFACE], [BOUNDARY], [LINE]])
+    colours[_GREEN], colours[_RED] = (0, 255, 0), (255, 0, 0)
+    light = np.rint(255 * np.arange(1, history + 2) / (history + 1))
+    colours[_OTHERS : _OTHERS + history + 1, :2] = light[:, None]
+    colours[_OTHERS + history + 1 : _OTHERS + 2 * (history + 1), 2] = light
+    return colours
+
+
+def _shrink(picture: Image) -> Image:
+    """The area average [64, 64] of a square picture. Halving twice is four times faster than one step by four."""
+    while picture.shape[0] % 2 == 0 and picture.shape[0] >= 2 * IMAGE:
+        side = picture.shape[0] // 2
+        picture = cv2.resize(picture, (side, side), interpolation=cv2.INTER_AREA)
+    if picture.shape[0] != IMAGE:
+        picture = cv2.resize(picture, (IMAGE, IMAGE), interpolation=cv2.INTER_AREA)
+    return picture
+
+
+# --- the map --------------------------------------------------------------------------------------------------------
+
+
+def _fixed(points: Floats, affine: Floats) -> NDArray[np.int32]:
+    """World points [..., 2] as cv2's fixed-point pixel coordinates."""
+    fixed: NDArray[np.int32] = np.rint((points @ affine[:, :2].T + affine[:, 2]) * (1 << _SHIFT)).astype(np.int32)
+    return fixed
+
+
+@dataclass(frozen=True)
+class _Chart:
+    """What is painted of one lane: surface quads [Q, 4, 2] with a palette index, boundaries and lane lines [m]."""
+
+    shade: int
+    quads: Floats
+    boundaries: Sequence[Floats]
+    lines: Sequence[Floats]
+    low: Floats
+    high: Floats
+
+
+class _Map:
+    """The painted map of an Episode: one large picture where it fits into memory, else painted window by window."""
+
+    def __init__(self, lanes: Sequence[Lane], scale: float, window: int) -> None:
+        limits = {lane.speed_limit for lane in lanes}
+        self._charts = [_chart(lane, plain=len(limits) < 2) for lane in lanes]
+        self._scale, self._reach = scale, window * 2**0.5 / scale
+        self._picture: Image | None = None
+        if not lanes:
+            return
+        self._origin = np.min([chart.low for chart in self._charts], axis=0) - 1
+        extent = np.max([chart.high for chart in self._charts], axis=0) + 1 - self._origin
+        columns, rows = np.ceil(extent * scale).astype(int).tolist()
+        if max(columns, rows) <= MAP_SIDE and columns * rows <= MAP_BYTES:
+            self._picture = np.zeros((rows, columns), np.uint8)
+            affine = np.column_stack([np.eye(2) * scale, -self._origin * scale - 0.5])
+            _paint(self._picture, self._charts, affine, scale)
+
+    def paint(self, canvas: Image, affine: Floats) -> None:
+        """Overwrite the canvas with the map as it lies under `affine`, world [m] -> pixels."""
+        if self._picture is not None:
+            back = affine[:, :2].T / self._scale  # a turn times scale: its inverse, times scale
+            shift = -back @ affine[:, 2] - self._origin * self._scale - 0.5
+            flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
+            cv2.warpAffine(self._picture, np.column_stack([back, shift]), canvas.shape, dst=canvas, flags=flags)
+            return
+        canvas.fill(0)
+        centre = np.linalg.solve(affine[:, :2], np.array(canvas.shape) / 2 - affine[:, 2])
+        low, high = centre - self._reach / 2, centre + self._reach / 2
+        near = [chart for chart in self._charts if (chart.low <= high).all() and (chart.high >= low).all()]
+        _paint(canvas, near, affine, self._scale)
+
+
+def _chart(lane: Lane, *, plain: bool) -> _Chart:
+    shade = _PLAIN
+    if not plain and lane.speed_limit is not None:
+        shade = 1 + int(np.clip(round(lane.speed_limit / LIMIT_STEP), 0, LIMIT_SHADES - 1))
+    centre = lane.centre[np.concatenate([[True], np.abs(np.diff(lane.centre, axis=0)).max(axis=1) > 1e-6])]
+    if len(centre) < 2:
+        centre = lane.centre
+    tangent = np.gradient(centre, axis=0)
+    tangent /= np.hypot(*tangent.T)[:, None].clip(1e-9)
+    left = centre + lane.width / 2 * np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+    right = 2 * centre - left
+    boundaries, lines = [], []
+    for side, border in ((left, lane.left), (right, lane.right)):
+        if border == "curb":
+            boundaries.append(side)
+        elif border == "solid":
+            lines.append(side)
+        elif border == "dashed":
+            lines.extend(_dashes(side))
+    edges = np.concatenate([left, right])
+    quads = np.stack([left[:-1], left[1:], right[1:], right[:-1]], axis=1)
+    return _Chart(shade, quads, boundaries, lines, edges.min(axis=0), edges.max(axis=0))
+
+
+def _dashes(line: Floats) -> list[Floats]:
+    length = np.concatenate([[0.0], np.hypot(*np.diff(line, axis=0).T).cumsum()])
+    starts = np.arange(0, length[-1], 2 * DASH)
+    along = (starts[:, None] + np.linspace(0, DASH, 4)).clip(max=length[-1])
+    return list(np.stack([np.interp(along, length, line[:, 0]), np.interp(along, length, line[:, 1])], axis=2))
+
+
+def _paint(canvas: Image, charts: Iterable[_Chart], affine: Floats, scale: float) -> None:
+    charts = list(charts)
+    for chart in charts:
+        for quad in _fixed(chart.quads, affine):
+            cv2.fillConvexPoly(canvas, quad, chart.shade, cv2.LINE_8, _SHIFT)
+    for kind, colour, metres in (("boundaries", _BOUNDARY, BOUNDARY_WIDTH), ("lines", _LINE, LINE_WIDTH)):
+        lines = [_fixed(line, affine) for chart in charts for line in getattr(chart, kind)]
+        width = max(1, round(metres * scale))
+        cv2.polylines(canvas, lines, False, colour, width, cv2.LINE_8, _SHIFT)  # noqa: FBT003
