@@ -1,0 +1,647 @@
+"""MLflow as the one store of results: sweep run -> cell runs -> seed runs, written live, committed whole, read back.
+
+A cell is done when its run is FINISHED with its `cell_key`. Everything a reader needs is logged before that, so a
+process may be killed at any point. Each attempt at a cell has a run of its own: whatever an earlier one has logged
+can then not double a curve, and is closed as KILLED when the next one starts.
+
+Keys of metrics are `<stage>/<split>/<metric>`; on a cell run they hold the mean over the policy seeds, beside
+`.../sd` (between seeds) and `.../low`, `.../high` (95 % interval of the mean, Student's t). `final/<metric>` is the
+mean of the last five epochs on test frames. Steps are epochs, and a point's time is the run's start + its step [ms],
+since MLflow takes the time into a point's identity.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import math
+import os
+import re
+import sqlite3
+import tempfile
+import threading
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from study.config import BadInputError, Cell, Grid, StudySettings, content_key
+from study.result import ARRAYS, NO_SEED, CellResult, SweepRecord
+
+# Nothing phones home, nothing is printed. A lost server is asked again for about half a minute, MLflow's own default
+# being four minutes; whoever sets these differently is obeyed.
+os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
+for _name, _value in {
+    "MLFLOW_LOGGING_LEVEL": "ERROR",
+    "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",
+    "MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR": "false",
+    "MLFLOW_HTTP_REQUEST_TIMEOUT": "30",
+    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "5",
+    "MLFLOW_HTTP_REQUEST_BACKOFF_FACTOR": "1",
+    "GIT_PYTHON_REFRESH": "quiet",
+}.items():
+    os.environ.setdefault(_name, _value)
+
+from mlflow.entities import Dataset, DatasetInput, InputTag, Metric, Param, Run, RunTag  # noqa: E402 - reads the above
+from mlflow.exceptions import MlflowException  # noqa: E402
+from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore  # noqa: E402
+from mlflow.tracking import MlflowClient  # noqa: E402
+from sqlalchemy.exc import SQLAlchemyError  # noqa: E402 - comes with mlflow, which lets its errors through
+
+DEFAULT_URI = "sqlite:///mlruns/mlflow.db"
+SQLITE = "sqlite:///"
+SCHEMES = ("sqlite:///", "http://", "https://", "postgresql://", "postgresql+psycopg2://", "postgresql+psycopg://")
+PROBE = 3.0  # [s] a server has to answer when a tracker is opened
+FLUSH = 2.0  # [s] between two writes of live curves
+RESULT = "result"  # artifact folder of a cell run
+RESULT_FILES = (*(f"{part}.safetensors" for part in ARRAYS), "curves.parquet", "cell.json")
+PLAN_VERSION = 1
+VALUE_LIMIT = 4000  # characters of a parameter or tag; MLflow takes 6000 and 8000, its databases 8000
+PARENT, COMMIT, NOTE = "mlflow.parentRunId", "mlflow.source.git.commit", "mlflow.note.content"
+
+Status = Literal["FINISHED", "FAILED", "KILLED"]
+Point = tuple[str, int, float]  # metric, epoch, value
+Numbers = NDArray[np.float64]
+
+
+class TrackerLostError(BadInputError):
+    """The store does not answer or cannot be written just now: another try may help."""
+
+
+@dataclass
+class CellRun:
+    """One attempt at a cell. Live points gather here, and a thread of its own writes them, so training never waits."""
+
+    run_id: str
+    key: str
+    cell: Cell
+    started: int
+    client: MlflowClient
+    seeds: dict[int, str] = field(default_factory=dict)
+    _pending: list[Metric] = field(default_factory=list)
+    _seen: set[tuple[str, int]] = field(default_factory=set)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+    _end: threading.Event = field(default_factory=threading.Event)
+    _thread: threading.Thread | None = None
+
+    def log(self, stage: str, epoch: int, metrics: Mapping[str, float]) -> None:
+        """Take the points of one epoch, named such as "test/loss_rec". A point that is there already is left out."""
+        self._add((f"{stage}/{name}", epoch, float(value)) for name, value in metrics.items())
+        if self._thread is None and not self._end.is_set():
+            self._thread = threading.Thread(target=self._write_on, daemon=True, name=f"log {self.cell.label}")
+            self._thread.start()
+
+    def _add(self, points: Iterable[Point]) -> None:
+        with self._lock:
+            for name, step, value in points:
+                if (name, step) not in self._seen:
+                    self._seen.add((name, step))
+                    self._pending.append(Metric(name, value, self.started + step, step))
+
+    def _write_on(self) -> None:
+        while not self._end.wait(FLUSH):
+            # What cannot be written now waits in memory; commit writes it or says why it cannot.
+            with suppress(MlflowException, SQLAlchemyError, OSError):
+                self._flush()
+
+    def _flush(self) -> None:
+        with self._lock:
+            batch, self._pending = self._pending, []
+        try:
+            self.client.log_batch(self.run_id, metrics=batch)
+        except BaseException:
+            with self._lock:  # written in part or whole, it may be written again: the same points are the same rows
+                self._pending = batch + self._pending
+            raise
+
+    def stop(self) -> None:
+        """End the thread. Points it has not written stay."""
+        self._end.set()
+        if self._thread is not None:
+            self._thread.join()
+
+    def finish(self, points: Iterable[Point]) -> None:
+        """Write the whole curves, less what was written live."""
+        self.stop()
+        self._add(points)
+        self._flush()
+
+
+class Tracker:
+    """The store of results behind one URI and one experiment.
+
+    Every method raises TrackerLostError, a BadInputError, when the store stops answering.
+    """
+
+    def __init__(self, uri: str = DEFAULT_URI, experiment: str = "study") -> None:
+        """Open the store and create what is missing. Raises BadInputError when it is not there or not MLflow's."""
+        self.uri = masked(uri)
+        if not uri.startswith(SCHEMES) or uri == SQLITE:
+            raise BadInputError(f"tracking URI '{self.uri}' cannot be used; give {DEFAULT_URI} or http://host:port")
+        folder = None
+        if uri.startswith(SQLITE):
+            path = Path(uri.removeprefix(SQLITE).partition("?")[0]).absolute()
+            folder = path.parent / "artifacts"
+            _prepare_file(path, folder, self.uri)
+            uri = f"{SQLITE}{path}"
+        elif uri.startswith("http"):
+            _probe(uri, self.uri)
+        else:
+            folder = Path(DEFAULT_URI.removeprefix(SQLITE)).absolute().parent / "artifacts"
+        with self._guard(opening=True), _few_tries():
+            self.client = MlflowClient(uri)
+            self.experiment = self._open_experiment(experiment, folder)
+            if uri.startswith(SQLITE) and folder is not None:
+                self._follow(path, folder)
+
+    def _open_experiment(self, name: str, folder: Path | None) -> str:
+        found = self.client.get_experiment_by_name(name)
+        if found is None:
+            tags = {NOTE: "Sweeps, their cells, and the policy seeds of each cell. Written by study/tracking.py."}
+            try:
+                return str(self.client.create_experiment(name, str(folder) if folder else None, tags))
+            except MlflowException:  # another process was faster, or nothing can be created
+                found = self.client.get_experiment_by_name(name)
+                if found is None:
+                    raise
+        if found.lifecycle_stage != "active":
+            raise BadInputError(
+                f"experiment '{name}' in {self.uri} is deleted; run "
+                f"MLFLOW_TRACKING_URI={self.uri} mlflow experiments restore -x {found.experiment_id}"
+            )
+        return str(found.experiment_id)
+
+    def _follow(self, path: Path, folder: Path) -> None:
+        """Let the database point to the artifacts beside it: MLflow stores whole paths, and folders are moved."""
+        old = str(self.client.get_experiment(self.experiment).artifact_location)
+        new = str(folder)
+        if old == new or not old.startswith("/") or not old.endswith("/artifacts") or not folder.is_dir():
+            return
+        with sqlite3.connect(path, timeout=20) as database:
+            database.execute(
+                "UPDATE experiments SET artifact_location = ? WHERE experiment_id = ?", (new, int(self.experiment))
+            )
+            database.execute(
+                "UPDATE runs SET artifact_uri = ? || substr(artifact_uri, ?) WHERE substr(artifact_uri, 1, ?) = ?",
+                (new, len(old) + 1, len(old) + 1, f"{old}/"),
+            )
+        database.close()
+
+    @contextmanager
+    def _guard(self, *, opening: bool = False) -> Iterator[None]:
+        """Turn the store's troubles into one clear error; mistakes of this program stay what they are."""
+        try:
+            yield
+        except (MlflowException, SQLAlchemyError, OSError) as error:
+            code = getattr(error, "error_code", None)
+            if code in ("INVALID_PARAMETER_VALUE", "BAD_REQUEST") and not opening:
+                raise
+            text = " ".join(masked(str(error)).split())[:400]
+            step = "start it, or choose another with --tracking"
+            if self.uri.startswith("sqlite"):
+                step = "look at disk space and rights, or choose another with --tracking"
+            if "db upgrade" in text:
+                step = f"copy the file, then run: mlflow db upgrade {self.uri}"
+            # `from None`: what lies below may name credentials.
+            raise TrackerLostError(f"the tracking store {self.uri} gave no usable answer: {text}; {step}") from None
+
+    # --- sweeps ---------------------------------------------------------------------------------------------------
+
+    def open_sweep(
+        self,
+        grid: Grid,
+        profile: str,
+        settings: StudySettings,
+        planned: Mapping[str, Cell],
+        data: Mapping[str, Any],
+        provenance: Mapping[str, Any],
+    ) -> str:
+        """The run id of this plan's sweep run: the one there is, taken up again, or a new one.
+
+        `data` is the frame store's manifest; it becomes an MLflow dataset whose digest is its `key`.
+        """
+        plan: dict[str, Any] = {
+            "format_version": PLAN_VERSION,
+            "grid": grid.model_dump(mode="json"),
+            "profile": profile,
+            "settings": settings.model_dump(mode="json"),
+            "planned": {key: cell.model_dump(mode="json") for key, cell in planned.items()},
+        }
+        key = content_key("sweep run", plan, (), PLAN_VERSION)
+        name = f"{grid.name} ({profile})"
+        facts = {name: value for name, value in provenance.items() if name != "diff"}
+        with self._guard():
+            sweeps = self._search("tags.kind = 'sweep'")
+            latest = max((_opened(run) for run in sweeps), default=0)
+            tags = {
+                "opened": str(max(time.time_ns() // 1_000_000, latest + 1)),  # the order holds when a clock jumps
+                "uncommitted": str(bool(provenance.get("dirty"))).lower(),
+                "reused": self._reused(planned, name),
+                **({COMMIT: str(provenance["commit"])} if provenance.get("commit") else {}),
+            }
+            mine = [run for run in sweeps if run.data.tags.get("plan_key") == key]
+            if mine:
+                run_id = str(mine[0].info.run_id)
+                self.client.update_run(run_id, status="RUNNING")
+            else:
+                identity = {"kind": "sweep", "sweep": grid.name, "profile": profile, "plan_key": key, NOTE: grid.title}
+                run_id = self._create(name, identity)
+                first = self._search(f"tags.plan_key = '{key}'")[0].info.run_id
+                if first != run_id:  # two parents started at once: both take the same one
+                    self.client.delete_run(run_id)
+                    run_id = str(first)
+                params = {**_flat(plan["grid"]), "profile": profile, **_flat(plan["settings"])}
+                self.client.log_batch(run_id, params=_params(params))
+            self.client.log_batch(run_id, tags=[RunTag(name, _short(value)) for name, value in tags.items() if value])
+            self.client.log_dict(run_id, plan, "plan.json")
+            self.client.log_dict(run_id, dict(data), "data.json")
+            self.client.log_dict(run_id, facts, "provenance.json")
+            self.client.log_text(run_id, str(provenance.get("diff") or ""), "uncommitted.diff")
+            if data:
+                self.client.log_inputs(run_id, datasets=[_dataset(data)])
+        return run_id
+
+    def _reused(self, planned: Mapping[str, Cell], name: str) -> str:
+        """Planned cells that another sweep has finished, in words."""
+        runs = self._finished(planned)
+        others = {key: run.data.tags.get("sweep", "") for key, run in runs.items()}
+        return ", ".join(f"{planned[key].label} from {sweep}" for key, sweep in others.items() if sweep != name)
+
+    def close_sweep(self, sweep_run_id: str, status: Status) -> None:
+        """End a sweep run, and whatever cell run under it still says RUNNING."""
+        with self._guard():
+            for run in self._search(
+                f"tags.kind = 'cell' and attributes.status = 'RUNNING' and tags.`{PARENT}` = '{sweep_run_id}'"
+            ):
+                self._close(run.info.run_id, "KILLED", {"reason": "the sweep ended"})
+            planned = self._json(sweep_run_id, "plan.json")["planned"]
+            done = len(self._finished(planned))
+            self.client.set_tag(sweep_run_id, "cells", f"{done} of {len(planned)} finished")
+            self.client.set_terminated(sweep_run_id, status)
+
+    def sweep_run(self, name: str, profile: str | None = None) -> str:
+        """Run id of the latest sweep run of that name. Raises BadInputError naming the sweeps there are."""
+        with self._guard():
+            sweeps = sorted(self._search("tags.kind = 'sweep'"), key=_opened)
+        for run in reversed(sweeps):
+            tags = run.data.tags
+            if tags.get("sweep") == name and profile in (None, tags.get("profile")):
+                return str(run.info.run_id)
+        wanted = f"{name} ({profile})" if profile else name
+        there = ", ".join(sorted({str(run.info.run_name) for run in sweeps})) or "none yet"
+        raise BadInputError(
+            f"no sweep '{wanted}' in {self.uri}; there are: {there}. Run it with: python -m study.sweep {name}"
+        )
+
+    def read_sweep(self, name: str, profile: str | None = None) -> SweepRecord:
+        """The latest sweep of that name with its finished cells, whichever sweep has trained them."""
+        run_id = self.sweep_run(name, profile)
+        with self._guard():
+            plan = self._json(run_id, "plan.json")
+            if plan.get("format_version") != PLAN_VERSION:
+                raise BadInputError(f"sweep run {run_id}: plan format {plan.get('format_version')}, not {PLAN_VERSION}")
+            provenance = self._json(run_id, "provenance.json") | {"diff": self._text(run_id, "uncommitted.diff")}
+            data = self._json(run_id, "data.json")
+            try:
+                planned = {key: Cell.model_validate(cell) for key, cell in plan["planned"].items()}
+                grid, settings = Grid.model_validate(plan["grid"]), StudySettings.model_validate(plan["settings"])
+            except ValueError as error:  # pydantic's complaint is one
+                raise BadInputError(
+                    f"sweep run {run_id} in {self.uri} was planned by another version of this program ({error}); "
+                    "run the sweep again"
+                ) from error
+            done = self.finished(planned)
+            failed = {
+                key: run.data.tags.get("reason", "unknown")
+                for run in self._search("tags.kind = 'cell' and attributes.status = 'FAILED'")
+                if (key := run.data.tags.get("cell_key")) in planned and key not in done
+            }
+        results = {key: self.load_result(done[key]) for key in planned if key in done}
+        return SweepRecord(grid, str(plan["profile"]), settings, planned, results, failed, provenance, data)
+
+    # --- cells ----------------------------------------------------------------------------------------------------
+
+    def finished(self, keys: Collection[str]) -> dict[str, str]:
+        """Key -> run id of the cells that are done, whichever sweep has trained them; of several, the first done."""
+        with self._guard():
+            return {key: str(run.info.run_id) for key, run in self._finished(keys).items()}
+
+    def _finished(self, keys: Collection[str]) -> dict[str, Run]:
+        wanted = set(keys)
+        runs = self._search("tags.kind = 'cell' and attributes.status = 'FINISHED'")
+        found: dict[str, Run] = {}
+        for run in sorted(runs, key=lambda run: (run.info.end_time, run.info.run_id)):
+            key = run.data.tags.get("cell_key")
+            if key in wanted:
+                found.setdefault(key, run)
+        return {key: found[key] for key in keys if key in found}
+
+    def start_cell(
+        self, sweep_run_id: str, cell: Cell, key: str, settings: StudySettings, policy_seeds: int
+    ) -> CellRun:
+        """A new attempt at a cell. Earlier attempts that still say RUNNING are closed as KILLED."""
+        params = {
+            "heads": cell.heads,
+            "fraction": cell.fraction,
+            "encoder_seed": cell.encoder_seed,
+            "policy_seeds": policy_seeds,
+            **_flat(settings.model_dump(mode="json")),
+        }
+        with self._guard():
+            before = self._search(f"tags.kind = 'cell' and tags.cell_key = '{key}'")
+            sweep = self.client.get_run(sweep_run_id)
+            tags = {
+                "kind": "cell",
+                "cell_key": key,
+                "attempt": str(1 + len(before)),
+                "sweep": sweep.info.run_name,
+                PARENT: sweep_run_id,
+            }
+            run_id = self._create(cell.label, tags)
+            for run in before:
+                if run.info.status == "RUNNING":
+                    self._close(run.info.run_id, "KILLED", {"superseded_by": run_id})
+                attempt = run.data.tags.get("attempt", "?")
+                if run.info.status != "FINISHED" and run.info.run_name == cell.label:
+                    self.client.update_run(run.info.run_id, name=f"{cell.label} (attempt {attempt})")
+            self.client.log_batch(run_id, params=_params(params))
+            if sweep.inputs.dataset_inputs:
+                self.client.log_inputs(run_id, datasets=sweep.inputs.dataset_inputs)
+            started = self.client.get_run(run_id).info.start_time
+        return CellRun(run_id, key, cell, started, self.client)
+
+    def commit(self, cell_run: CellRun, result: CellResult) -> str:
+        """Log a result whole, and only then mark its run FINISHED. Returns the run id that holds the key's result.
+
+        When another attempt has finished this key meanwhile, that one counts and this run ends as KILLED. After a
+        TrackerLostError it can be called again: nothing is doubled.
+        """
+        if result.key != cell_run.key:
+            raise ValueError(f"result of cell {result.key} given for the run of {cell_run.key}")
+        with self._guard():
+            other = self._finished([cell_run.key]).get(cell_run.key)
+            if other is not None and other.info.run_id != cell_run.run_id:
+                cell_run.stop()
+                self._close(cell_run.run_id, "KILLED", {"superseded_by": other.info.run_id})
+                return str(other.info.run_id)
+            with tempfile.TemporaryDirectory() as folder:
+                for file in sorted(result.save(Path(folder) / RESULT).iterdir()):
+                    self.client.log_artifact(cell_run.run_id, str(file), RESULT)
+            scores = scores_of(result)
+            self._log_seeds(cell_run, result.curves, scores)
+            cell_run.finish(cell_points(result.curves))
+            numbers, words = _facts(result.facts)
+            for ending, values in bands(scores).items():
+                numbers |= {f"final/{name}{ending}": v for name, v in zip(scores.columns, values, strict=True)}
+            self.client.log_batch(
+                cell_run.run_id,
+                metrics=[Metric(n, float(v), cell_run.started, 0) for n, v in numbers.items() if math.isfinite(v)],
+                tags=[RunTag(name, _short(value)) for name, value in words.items()],
+            )
+            self.client.set_terminated(cell_run.run_id, "FINISHED")
+        return cell_run.run_id
+
+    def _log_seeds(self, cell_run: CellRun, curves: pd.DataFrame, scores: pd.DataFrame) -> None:
+        start = cell_run.started
+        for seed in scores.index.tolist():
+            if seed not in cell_run.seeds:
+                tags = {"kind": "seed", "policy_seed": str(seed), PARENT: cell_run.run_id}
+                cell_run.seeds[seed] = self._create(f"policy {seed:02d}", tags, start)
+            own = points(curves[curves["policy_seed"] == seed])
+            metrics = [Metric(name, value, start + epoch, epoch) for name, epoch, value in own]
+            metrics += [Metric(f"final/{name}", value, start, 0) for name, value in scores.loc[seed].to_dict().items()]
+            self.client.log_batch(cell_run.seeds[seed], metrics=metrics)
+            self.client.set_terminated(cell_run.seeds[seed], "FINISHED")
+
+    def fail(self, cell_run: CellRun, reason: str) -> None:
+        """End an attempt that cannot be finished; the reason becomes a tag and, in full, an artifact."""
+        cell_run.stop()
+        with self._guard():
+            self.client.log_text(cell_run.run_id, masked(reason), "failure.txt")
+            self._close(cell_run.run_id, "FAILED", {"reason": masked(reason)})
+
+    def interrupt(self, cell_run: CellRun) -> None:
+        """End an attempt that was stopped, quickly; when the store does not answer, the next attempt closes it."""
+        with suppress(TrackerLostError), self._guard(), _few_tries():
+            self._close(cell_run.run_id, "KILLED", {"reason": "stopped"})
+
+    def load_result(self, run_id: str) -> CellResult:
+        """The result that a finished cell run holds. Raises BadInputError when it is not whole."""
+        with self._guard(), tempfile.TemporaryDirectory() as name:
+            key = self.client.get_run(run_id).data.tags.get("cell_key")
+            folder = Path(name)
+            try:
+                # Only names that we know are asked for, so no name from the store can point out of the folder.
+                for file in RESULT_FILES:
+                    Path(self.client.download_artifacts(run_id, f"{RESULT}/{file}", name)).replace(folder / file)
+                result = CellResult.load(folder)
+                wrong = f"it is the result of cell {result.key}" if result.key != key else ""
+            except (OSError, BadInputError) as error:
+                wrong = str(error).replace(f"{name}/", "").replace(name, RESULT)
+            if wrong:
+                raise BadInputError(
+                    f"cell run {run_id} in {self.uri} is FINISHED but does not hold the whole result of cell {key} "
+                    f"({wrong}); delete that run in MLflow and run the sweep again"
+                )
+        return result
+
+    def log_files(self, run_id: str, files: Iterable[Path], artifact_path: str) -> None:
+        """Add files to a run's artifacts."""
+        with self._guard():
+            for file in files:
+                self.client.log_artifact(run_id, str(file), artifact_path)
+
+    # --- below ----------------------------------------------------------------------------------------------------
+
+    def _search(self, query: str) -> list[Run]:
+        """All runs that match, the first started first."""
+        runs: list[Run] = []
+        token = None
+        while True:
+            page = self.client.search_runs([self.experiment], query, max_results=1000, page_token=token)
+            runs += page
+            token = page.token
+            if not token:
+                return sorted(runs, key=lambda run: (run.info.start_time, run.info.run_id))
+
+    def _create(self, name: str, tags: Mapping[str, str], start: int | None = None) -> str:
+        return str(self.client.create_run(self.experiment, start, dict(tags), name).info.run_id)
+
+    def _close(self, run_id: str, status: Status, tags: Mapping[str, str]) -> None:
+        """End a run and the seed runs below it."""
+        for seed in self._search(f"tags.kind = 'seed' and tags.`{PARENT}` = '{run_id}'"):
+            if seed.info.status == "RUNNING":
+                self.client.set_terminated(seed.info.run_id, status)
+        self.client.log_batch(run_id, tags=[RunTag(name, _short(value)) for name, value in tags.items()])
+        self.client.set_terminated(run_id, status)
+
+    def _text(self, run_id: str, name: str) -> str:
+        with tempfile.TemporaryDirectory() as folder:
+            return Path(self.client.download_artifacts(run_id, name, folder)).read_text(encoding="utf-8")
+
+    def _json(self, run_id: str, name: str) -> dict[str, Any]:
+        content = json.loads(self._text(run_id, name))
+        if not isinstance(content, dict):
+            raise BadInputError(f"{name} of run {run_id} in {self.uri} is no JSON object; run the sweep again")
+        return content
+
+
+# --- curves ---------------------------------------------------------------------------------------------------------
+
+
+def scores_of(result: CellResult) -> pd.DataFrame:
+    """Mean of the last five epochs on test frames (Sec. V-B): one row per policy seed, one column per metric."""
+    from study.stats import final_scores  # noqa: PLC0415 - scipy, which reading what is finished does not need
+
+    cell = result.cell
+    table = result.curves.assign(heads=cell.heads, fraction=cell.fraction, encoder_seed=cell.encoder_seed)
+    return final_scores(table).pivot_table(index="policy_seed", columns="metric", values="value")
+
+
+def bands(values: pd.DataFrame) -> dict[str, Numbers]:
+    """Mean, and `/sd`, `/low`, `/high`, over the seeds (rows), of each column; the ends are NaN for one seed."""
+    from study.stats import t_limits  # noqa: PLC0415 - as above
+
+    low, high = t_limits(values.to_numpy(np.float64))
+    mean, sd = values.mean(axis=0).to_numpy(np.float64), values.std(axis=0).to_numpy(np.float64)
+    return {"": mean, "/sd": sd, "/low": low, "/high": high}
+
+
+def cell_points(curves: pd.DataFrame) -> Iterator[Point]:
+    """Points of a cell run: the encoder's curves, and mean, sd and interval over the policy seeds."""
+    own = curves["policy_seed"] == NO_SEED
+    yield from points(curves[own])
+    for names, rows in curves[~own].groupby(["stage", "split", "metric"], sort=False):
+        wide = rows.pivot_table(index="policy_seed", columns="epoch", values="value", dropna=False)
+        for ending, values in bands(wide).items():
+            name = "/".join(str(part) for part in names) + ending
+            for epoch, value in zip(wide.columns, values.tolist(), strict=True):
+                if not ending or math.isfinite(value):
+                    yield name, int(epoch), value
+
+
+def points(curves: pd.DataFrame) -> Iterator[Point]:
+    """Name, epoch and value of each row."""
+    names = curves["stage"] + "/" + curves["split"] + "/" + curves["metric"]
+    return zip(names.tolist(), curves["epoch"].tolist(), curves["value"].tolist(), strict=True)
+
+
+# --- plain values ---------------------------------------------------------------------------------------------------
+
+
+def masked(text: str) -> str:
+    """The text with the credentials of any URI in it hidden."""
+    return re.sub(r"(\w://)[^/@\s]*@", r"\1***@", text)
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= VALUE_LIMIT else f"{text[: VALUE_LIMIT - 40]}... [{len(text)} characters, cut]"
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested mappings as one, with dotted names."""
+    flat: dict[str, Any] = {}
+    for name, value in values.items():
+        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
+    return flat
+
+
+def _params(values: Mapping[str, Any]) -> list[Param]:
+    texts = {name: value if isinstance(value, str) else json.dumps(value) for name, value in values.items()}
+    return [Param(name, _short(text)) for name, text in texts.items()]
+
+
+def _facts(facts: Mapping[str, Any]) -> tuple[dict[str, float], dict[str, str]]:
+    """What a cell says of itself: numbers as metrics such as `seconds/encoder`, words as tags."""
+    numbers: dict[str, float] = {}
+    words: dict[str, str] = {}
+    origin = facts.get("provenance", {})
+    if origin.get("commit"):
+        words[COMMIT] = str(origin["commit"])
+    for name in ("dirty", "python", "platform", "cpu"):
+        if name in origin:
+            words[name] = str(origin[name])
+    for name, value in _flat({name: value for name, value in facts.items() if name != "provenance"}).items():
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            numbers[name.replace(".", "/")] = float(value)
+        else:
+            words[name] = value if isinstance(value, str) else json.dumps(value)
+    return numbers, words
+
+
+def _dataset(data: Mapping[str, Any]) -> DatasetInput:
+    digest = str(data.get("key") or content_key("data", dict(data), (), PLAN_VERSION))
+    source = json.dumps({"tags": {"frame store": digest, "manifest": "data.json of the sweep run"}})
+    profile = json.dumps({name: value for name, value in _flat(data).items() if isinstance(value, int | float)})
+    entity = Dataset("frames", digest[:36], "code", source, profile=profile[:100_000])
+    return DatasetInput(entity, [InputTag("mlflow.data.context", "train and test")])
+
+
+def _opened(run: Run) -> int:
+    return int(run.data.tags.get("opened", 0))
+
+
+# --- stores ---------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _few_tries() -> Iterator[None]:
+    """Ask a server once or twice only, and a few seconds at most."""
+    names = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1", "MLFLOW_HTTP_REQUEST_TIMEOUT": str(int(PROBE))}
+    before = {name: os.environ.get(name) for name in names}
+    os.environ.update(names)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is not None:
+                os.environ[name] = value
+
+
+def _probe(uri: str, shown: str) -> None:
+    """Raise TrackerLostError when a server does not answer at once."""
+    url = re.sub(r"//[^/@]*@", "//", uri).rstrip("/") + "/health"
+    try:
+        with urllib.request.urlopen(url, timeout=PROBE):  # noqa: S310 - the scheme is http or https
+            pass
+    except urllib.error.HTTPError:
+        pass  # it answers; whether it is MLflow shows at the first question
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "reason", error)
+        raise TrackerLostError(
+            f"the tracking server {shown} does not answer ({reason}); start it (mlflow server), "
+            f"check the address, or leave --tracking out to use {DEFAULT_URI}"
+        ) from None
+
+
+def _prepare_file(path: Path, artifacts: Path, shown: str) -> None:
+    """Make the database whole or not at all; refuse a file that is not MLflow's."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if not path.exists():
+            # MLflow needs seconds for its tables; a process killed in between would leave a database half made.
+            with path.with_name(f".{path.name}.lock").open("w") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX)
+                if not path.exists():
+                    draft = path.with_name(f".{path.name}.draft")
+                    draft.unlink(missing_ok=True)
+                    SqlAlchemyStore(f"{SQLITE}{draft}", str(artifacts))._dispose_engine()  # noqa: SLF001 - closes it
+                    draft.replace(path)
+            return
+        with sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True, timeout=20) as database:
+            tables = {row[0] for row in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+        database.close()
+    except (OSError, sqlite3.Error, SQLAlchemyError, MlflowException) as error:
+        raise BadInputError(
+            f"{shown} cannot be used as a tracking store: {error}; move the file away or give another --tracking"
+        ) from None
+    if not {"experiments", "runs", "alembic_version"} <= tables:
+        raise BadInputError(f"{shown} is a database, but not MLflow's; give another file with --tracking")
