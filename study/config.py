@@ -177,6 +177,25 @@ class StudySettings(Settings):
 Fraction = Annotated[float, Field(gt=0, le=1)]
 
 
+class Rules(Settings):
+    """When a claim counts as reproduced, decided before the run (PAPER.md section 3; used by `study.claims`)."""
+
+    alpha: Annotated[float, Field(gt=0, lt=0.5)] = Field(0.05, description="error rate of a claim's contrasts together")
+    accuracy_margin: NotNegative = Field(0.005, description="smallest difference in accuracy that matters")
+    encoder_allowance: NotNegative = Field(
+        0.01,
+        description="what two encoders may differ in accuracy by their seeds alone; added to both ends of an interval "
+        "when there is one encoder for each cell",
+    )
+    steering_margin: NotNegative = Field(
+        0.05, description="largest difference in steering loss that is none, as a share of the best constant's loss"
+    )
+    reach_slack: Share = Field(0.1, description="how much later than the text says, as a share of all epochs")
+    spread_factor: Annotated[float, Field(ge=1)] = Field(
+        1.5, description="what two encoders may differ in the variance of their policies, with one encoder for each cell"
+    )
+
+
 class Grid(Settings):
     """A sweep file: the cells of a study and what is read off them."""
 
@@ -190,6 +209,7 @@ class Grid(Settings):
     policy_seeds: Count = Field(15, description="policies on each encoder (Sec. V-A: 15)")
     baseline: str = Field("rec", description="head set that the others are compared with")
     claims: tuple[str, ...] = Field((), description="claims of the paper that this sweep tests")
+    rules: Rules = Field(Rules(), description="when a claim counts as reproduced")
 
     @model_validator(mode="after")
     def _known(self) -> Self:

@@ -10,7 +10,7 @@ LAYERS = [
     {"birdview", "sim"},
     {"frames"},
     {"autoencoder", "policy", "stats"},
-    {"cell"},
+    {"cell", "claims"},
     {"tracking", "grid", "figures", "display"},
     {"data", "report", "worker"},
     {"sweep"},

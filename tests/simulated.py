@@ -1,0 +1,195 @@
+"""Sweep records drawn from known effects: real values of the real types, without any training."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pandas as pd
+
+from study.config import HEAD_SETS, Grid, StudySettings
+from study.result import CURVE_COLUMNS, NO_SEED, CellResult, SweepRecord
+
+FRAMES, EPISODES, SAMPLES = 600, 15, 8
+
+
+@dataclass(frozen=True)
+class World:
+    """What is true of the simulated study: accuracies and time constants by head set, noise by level."""
+
+    accuracy: dict[str, float] = field(
+        default_factory=lambda: {"rec": 0.835, "rec+pred": 0.847, "rec+plan": 0.862, "full": 0.876}
+    )
+    time: dict[str, float] = field(
+        default_factory=lambda: {"rec": 28.0, "rec+pred": 20.0, "rec+plan": 12.0, "full": 9.0}
+    )
+    spread: dict[str, float] = field(
+        default_factory=lambda: {"rec": 0.03, "rec+pred": 0.016, "rec+plan": 0.012, "full": 0.012}
+    )
+    by_fraction: float = 0.01  # accuracy lost for each halving of the data, rec; the others lose half of it
+    steering: float = 0.0011
+    steering_effect: float = 0.0
+    encoder_sd: float = 0.0
+    policy_sd: float = 0.002
+    epoch_sd: float = 0.0015
+    epochs: int = 100
+
+
+NULL = World(
+    accuracy=dict.fromkeys(HEAD_SETS, 0.835),
+    time=dict.fromkeys(HEAD_SETS, 28.0),
+    spread=dict.fromkeys(HEAD_SETS, 0.02),
+    by_fraction=0.0,
+    encoder_sd=0.0035,
+)
+
+HEADS_GRID = Grid(
+    name="heads", title="Effect of different heads", heads=tuple(HEAD_SETS), claims=("H1", "H2", "H3", "H4", "H5")
+)
+DATASIZE_GRID = Grid(
+    name="datasize",
+    title="Effect of dataset size",
+    heads=("rec", "full"),
+    fractions=(1.0, 0.5, 0.25, 0.125, 0.0625),
+    claims=("D1", "D2", "D3", "D4"),
+)
+
+
+def _rows(seeds, stage, split, metric, values):
+    """Tidy rows of values [S, E]."""
+    count, epochs = values.shape
+    return pd.DataFrame(
+        {
+            "policy_seed": np.repeat(seeds, epochs),
+            "stage": stage,
+            "split": split,
+            "epoch": np.tile(np.arange(1, epochs + 1), count),
+            "metric": metric,
+            "value": values.ravel(),
+        }
+    )[list(CURVE_COLUMNS)]
+
+
+def policy_curves(cell, world, seeds, rng):
+    """Accuracy and steering loss by epoch on both splits, [S, E] each."""
+    halvings = -np.log2(cell.fraction) * (1.0 if cell.heads == "rec" else 0.5)
+    final = world.accuracy[cell.heads] - world.by_fraction * halvings + rng.normal(0, world.encoder_sd)
+    epoch = np.arange(1, world.epochs + 1)
+    shape = np.exp(-epoch / (world.time[cell.heads] * (1 + 0.25 * halvings)))
+    own = rng.normal(0, world.policy_sd, (seeds, 1)) + rng.normal(0, world.spread[cell.heads], (seeds, 1)) * shape
+    test = final - 0.3 * shape + own + rng.normal(0, world.epoch_sd, (seeds, world.epochs))
+    loss = world.steering * (1 + 2 * shape) + world.steering_effect * (cell.heads != "rec")
+    loss = loss * (1 + rng.normal(0, 0.01, (seeds, 1)) + rng.normal(0, 0.005, (seeds, world.epochs)))
+    return {
+        ("test", "acceleration_accuracy"): test,
+        ("train", "acceleration_accuracy"): test + 0.03 * (1 - shape),
+        ("test", "balanced_accuracy"): test - 0.004,
+        ("train", "balanced_accuracy"): test + 0.026,
+        ("test", "steering_loss"): loss,
+        ("train", "steering_loss"): loss * 0.9,
+        ("test", "cross_entropy"): 1.1 - 0.8 * test,
+        ("train", "cross_entropy"): 1.05 - 0.8 * test,
+    }
+
+
+def simulate_cell(cell, key, settings, world, seeds, rng, labels):
+    """A whole result: curves, pictures, predictions whose accuracy is the last epoch's."""
+    curves = policy_curves(cell, world, seeds, rng)
+    parts = [_rows(np.arange(seeds), "policy", split, metric, values) for (split, metric), values in curves.items()]
+    heads = HEAD_SETS[cell.heads]
+    for split in ("train", "test"):
+        losses = {head: (0.05 + 0.4 * np.exp(-np.arange(settings.encoder.epochs) / 4))[None] for head in heads}
+        parts += [_rows(np.array([NO_SEED]), "encoder", split, f"loss_{head}", loss) for head, loss in losses.items()]
+        parts.append(_rows(np.array([NO_SEED]), "encoder", split, "loss", sum(losses.values())))
+    acceleration, steering, episode = labels
+    accuracy = curves["test", "acceleration_accuracy"][:, -1:]
+    wrong = rng.random((seeds, FRAMES)) > accuracy
+    guess = (acceleration + wrong * rng.integers(1, 3, (seeds, FRAMES))) % 3
+    images = _pictures(rng)
+    samples = {"input": images, "rec_output": (images * 0.9 + 12).astype(np.uint8)}
+    for head in set(heads) - {"rec"}:
+        mask = np.where(images.max(axis=3) > 180, 255, 0).astype(np.uint8)
+        samples |= {f"{head}_target": mask, f"{head}_output": (mask * 0.7 + 20).astype(np.uint8)}
+    return CellResult(
+        cell=cell,
+        key=key,
+        settings=settings.model_dump(mode="json") | {"policy_seeds": seeds, "frames_key": "f" * 16},
+        curves=pd.concat(parts, ignore_index=True),
+        encoder={"weight": np.zeros(4, np.float32)},
+        policies={"z_mean": np.zeros(64, np.float32)},
+        samples=samples,
+        predictions={
+            "acceleration": guess.astype(np.uint8),
+            "steering": (steering + rng.normal(0, 0.02, (seeds, FRAMES))).astype(np.float32),
+            "acceleration_label": acceleration,
+            "steering_label": steering,
+            "episode": episode,
+            "z": (rng.normal(size=(FRAMES, 64)) + np.eye(64)[0] * 2 * acceleration[:, None]).astype(np.float32),
+        },
+        facts={
+            "floor": float(np.bincount(acceleration).max() / FRAMES),
+            "frames": {
+                "encoder_train": round(20_000 * cell.fraction),
+                "encoder_test": 5000,
+                "policy_train": 10_000,
+                "policy_test": FRAMES,
+            },
+            "seconds": {"encoder": 412.0 * cell.fraction, "encode": 6.1, "policies": 131.0, "cell": 551.0},
+            "peak_bytes": 1_300_000_000,
+            "device": "cpu",
+            "precision": "fp32",
+            "threads": 2,
+        },
+    )
+
+
+def _pictures(rng):
+    """Bird views of a kind: road, lane line, route, cars."""
+    images = np.zeros((SAMPLES, 64, 64, 3), np.uint8)
+    for image in images:
+        left = int(rng.integers(18, 30))
+        image[:, left : left + 16] = 70
+        image[:, left + 8] = 200
+        image[:40, left + 3 : left + 5] = (0, 200, 0)
+        image[36:44, left + 2 : left + 6] = (40, 60, 255)
+        top = int(rng.integers(2, 24))
+        image[top : top + 8, left + 10 : left + 14] = (255, 230, 0)
+    return images
+
+
+def simulate(grid=HEADS_GRID, world=None, seed=0, settings=None, unfinished=(), failed=()):
+    """A record of a sweep. `unfinished` and `failed` are labels of cells without a result."""
+    world = world or World()
+    settings = settings or StudySettings()
+    rng = np.random.default_rng(seed)
+    labels = (
+        rng.choice(3, FRAMES, p=[0.34, 0.33, 0.33]).astype(np.uint8),
+        np.where(rng.random(FRAMES) < 0.4, 0, rng.uniform(-0.2, 0.2, FRAMES)).astype(np.float32),
+        np.sort(rng.integers(0, EPISODES, FRAMES)).astype(np.int32),
+    )
+    planned = {f"{index:016x}": cell for index, cell in enumerate(grid.cells(), 1)}
+    results = {
+        key: simulate_cell(cell, key, settings, world, grid.policy_seeds, rng, labels) for key, cell in planned.items()
+    }
+    broken = {key: "TrainingDivergedError: loss is nan" for key, cell in planned.items() if cell.label in failed}
+    gone = {key for key, cell in planned.items() if cell.label in (*unfinished, *failed)}
+    return SweepRecord(
+        grid=grid,
+        profile="laptop",
+        settings=settings,
+        planned=planned,
+        results={key: result for key, result in results.items() if key not in gone},
+        failed=broken,
+        provenance={
+            "commit": "0123456789abcdef0123456789abcdef01234567",
+            "dirty": False,
+            "diff": "",
+            "lock": "ab" * 32,
+            "packages": {"torch": "2.13.0", "lightning": "2.6.6", "highway-env": "1.12.1", "numpy": "2.4.0"},
+            "python": "3.11.9",
+            "platform": "Linux 6.1 x86_64",
+            "cpu": "A processor at 2.5 GHz",
+            "cores": 2,
+        },
+        data={"key": "f" * 16},
+    )
