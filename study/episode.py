@@ -270,6 +270,12 @@ def read_episode(folder: Path) -> Episode:
     return episode
 
 
+def episode_digest(folder: Path) -> str:
+    """Digest of an Episode from its head alone, the same as `read_episode` gives. Raises BadInputError for no head."""
+    path = folder / "episode.json"
+    return _digest(_field(_json(path), "digests", dict, path))
+
+
 def _json(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))

@@ -1,0 +1,676 @@
+"""Frame store: which recorded moments become frames, and their images, masks and labels on disk (Sec. IV-A, V).
+
+A store is a folder, written once and then only read:
+
+`manifest.json`             key, settings, source drives with digests, counts, digests, histograms before and after
+`encoder/`, `policy/`       the two sets, from different drives, each with
+    `images.npy`            [N, 64, 64, 3] uint8 RGB
+    `masks.npy`             [N, 2, 512] uint8: pred and plan, 4096 bits each, see `unpack_masks`
+    `labels.parquet`        one row for each frame, columns LABELS
+
+The main path is `build_frames`: every drive is read once for its candidate moments, the frames are chosen from all of
+them (`_choose`), then every drive's frames are painted into their rows of preallocated files. What is finished is
+journalled, so a build that was killed goes on, and ends with the same bytes whatever the number of processes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import hashlib
+import io
+import json
+import multiprocessing
+import multiprocessing.process
+import os
+import shutil
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from study.birdview import MASK_BYTES, RATE_HZ, Renderer, governing_light, valid_moments
+from study.config import (
+    ACCELERATIONS,
+    FORMAT_VERSIONS,
+    IMAGE,
+    STEERING_CROP,
+    BadInputError,
+    BirdviewSettings,
+    FramesSettings,
+    content_key,
+)
+from study.episode import episode_digest, file_digest, read_episode
+
+SCHEMA_VERSION = 1
+SETS = ("encoder", "policy")
+SHAPES = {"images": (IMAGE, IMAGE, 3), "masks": (2, MASK_BYTES)}
+STEERING_EDGES = (-0.15, -0.05, -0.01, 0.01, 0.05, 0.15)  # of the bins that the policy set is raked to (PROTOTYPE.md)
+STANDING = 0.1  # [m/s], below it a vehicle stands
+CHUNK = 512  # frames painted before they are written: 7 MB
+
+LABELS = pa.schema(
+    [
+        ("episode", pa.int32()),  # position in the manifest's list of the set's drives
+        ("agent", pa.int32()),  # the vehicle's id in its Episode
+        ("step", pa.int32()),
+        ("train", pa.bool_()),
+        ("steering", pa.float32()),
+        ("acceleration", pa.int8()),  # class, an index into ACCELERATIONS
+        ("speed", pa.float32()),  # [m/s]
+        ("light", pa.uint8()),  # of the governing light in range: 0 none or green, 1 yellow, 2 red
+        ("light_distance", pa.float32()),  # [m], NaN where there is none
+        ("lead_gap", pa.float32()),  # [m], NaN where the way is free
+        ("standing", pa.bool_()),
+    ]
+)
+
+# What a random generator is for; with the settings' seed it makes the generator.
+_PHASE, _SPLIT, _CHOICE, _SUBSET, _ORDER = range(5)
+
+Progress = Callable[[str, int, int], None]
+Indices = NDArray[np.int64]
+Bytes = NDArray[np.uint8]
+
+
+# --- reading --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Frames:
+    """One set of N frames: `images` [N, 64, 64, 3] uint8 RGB, `masks` [N, 2, 512] uint8, `labels` with N rows.
+
+    The arrays are memory-mapped; rows are ordered by drive, step and vehicle.
+    """
+
+    images: Bytes
+    masks: Bytes
+    labels: pd.DataFrame
+
+    def __len__(self) -> int:
+        """N."""
+        return len(self.images)
+
+    def indices(self, split: Literal["train", "test"]) -> Indices:
+        """Rows of a split, sorted."""
+        train = self.labels["train"].to_numpy()
+        return np.flatnonzero(train if split == "train" else ~train).astype(np.int64)
+
+    def subset(self, fraction: float, unit: Literal["frame", "drive"], seed: int) -> Indices:
+        """Rows of a random part of the training frames, sorted (Sec. V-B); smaller parts lie within larger ones.
+
+        `unit` says whether single frames or whole drives are drawn. Raises BadInputError when nothing is left.
+        """
+        if not 0 < fraction <= 1:
+            raise BadInputError(f"data fraction {fraction}: it must be above 0 and at most 1")
+        train = self.indices("train")
+        rng = np.random.default_rng([seed, _SUBSET])
+        if unit == "frame":
+            part = rng.permutation(train)[: round(fraction * len(train))]
+        else:
+            drives = self.labels["episode"].to_numpy()[train]
+            drawn = rng.permutation(np.unique(drives))
+            part = train[np.isin(drives, drawn[: round(fraction * len(drawn))])]
+        if not len(part):
+            raise BadInputError(f"a fraction of {fraction:g} of the training {unit}s is none at all; take a larger one")
+        return np.sort(part)
+
+
+@dataclass(frozen=True)
+class FrameStore:
+    """The two sets of a store, with its key and manifest."""
+
+    encoder: Frames
+    policy: Frames
+    manifest: dict[str, Any]
+    key: str
+
+
+def unpack_masks(masks: Bytes) -> Bytes:
+    """Packed masks [B, 2, 512] as [B, 2, 64, 64] uint8 of 0 and 1: pred, plan."""
+    return np.unpackbits(masks, axis=-1).reshape(*masks.shape[:-1], IMAGE, IMAGE)
+
+
+def epoch_order(indices: Indices, seed: int, epoch: int) -> Indices:
+    """The rows in the random order of one epoch: a function of seed and epoch only, so a resumed run sees the same."""
+    return np.random.default_rng([seed, _ORDER, epoch]).permutation(indices)
+
+
+def open_frames(folder: Path, *, check: bool = False) -> FrameStore:
+    """Open the store in `folder`; with `check`, compare every byte of the arrays with the manifest's digests.
+
+    Raises BadInputError when the folder holds no whole store, or arrays that are not its manifest's.
+    """
+    path = folder / "manifest.json"
+    try:
+        manifest = json.loads(path.read_text(encoding="utf-8"))
+        version = manifest["schema_version"]
+    except OSError as error:
+        raise BadInputError(f"cannot read {path}: {error.strerror}; is {folder} a frame store?") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise BadInputError(f"{path} is no manifest of a frame store ({error!r}): truncated or foreign") from error
+    if version != SCHEMA_VERSION:
+        raise BadInputError(f"{path}: schema_version is {version!r}; this program reads {SCHEMA_VERSION}")
+    try:
+        sets = {name: _open_set(folder / name, manifest["sets"][name], check=check) for name in SETS}
+        return FrameStore(**sets, manifest=manifest, key=str(manifest["key"]))
+    except (KeyError, TypeError, AttributeError) as error:
+        raise BadInputError(f"{path} lacks what a manifest holds ({error!r}): truncated or foreign") from error
+
+
+def _open_set(folder: Path, entry: dict[str, Any], *, check: bool) -> Frames:
+    remedy = "delete the store's folder and build it again"
+    arrays = {}
+    for name, shape in SHAPES.items():
+        path = folder / f"{name}.npy"
+        try:
+            array = np.load(path, mmap_mode="r", allow_pickle=False)
+        except (OSError, ValueError, EOFError) as error:
+            raise BadInputError(f"{path} is no whole array ({error}); {remedy}") from error
+        expected = (entry["frames"], *shape)
+        if array.shape != expected or array.dtype != np.uint8:
+            raise BadInputError(f"{path} is {array.shape} {array.dtype}, the manifest says {expected} uint8; {remedy}")
+        arrays[name] = array
+    path = folder / "labels.parquet"
+    try:
+        if file_digest(path) != entry["labels"]:
+            raise BadInputError(f"{path} does not match its digest in the manifest; {remedy}")
+        labels = pd.read_parquet(path)
+    except (OSError, ValueError, pa.ArrowException) as error:
+        raise BadInputError(f"{path} holds no labels ({error}); {remedy}") from error
+    if len(labels) != entry["frames"] or list(labels.columns) != LABELS.names:
+        raise BadInputError(f"{path} has {len(labels)} rows of {', '.join(labels.columns)}; {remedy}")
+    for part in entry["parts"] if check else ():
+        rows = slice(part["start"], part["start"] + part["rows"])
+        for name, array in arrays.items():
+            if _digest(array[rows]) != part[name]:
+                raise BadInputError(
+                    f"{folder / name}.npy, rows {rows.start} to {rows.stop - 1}, does not match its digest in the "
+                    f"manifest: changed on disk; {remedy}"
+                )
+    return Frames(**arrays, labels=labels)
+
+
+def _digest(array: Bytes) -> str:
+    return hashlib.sha256(np.ascontiguousarray(array).data).hexdigest()
+
+
+# --- building -------------------------------------------------------------------------------------------------------
+
+
+def build_frames(
+    frames: FramesSettings,
+    birdview: BirdviewSettings,
+    encoder_episodes: Sequence[Path],
+    policy_episodes: Sequence[Path],
+    folder: Path,
+    processes: int,
+    progress: Progress | None = None,
+    *,
+    key: str | None = None,
+) -> None:
+    """Build the frame store `folder` from recorded drives; nothing happens when it is there already.
+
+    `key` names the store; by default it follows from the settings and the drives' digests. `progress(stage, done,
+    total)` with stage "select" (drives) or "render" (frames). A build that was killed goes on where it was.
+    Raises BadInputError when the drives give too few frames, serve both sets, are no Episodes, when the disk is too
+    small, or when `folder` holds something else.
+    """
+    sources = {"encoder": _sources(encoder_episodes), "policy": _sources(policy_episodes)}
+    _check_sources(sources)
+    build = _Build(frames, birdview, {"encoder": encoder_episodes, "policy": policy_episodes}, sources, folder, key)
+    if build.finished():
+        return
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with build.locked():
+            if not build.finished():
+                with _pool(processes) as pool:
+                    build.run(pool, progress or (lambda *_: None))
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS, errno.ENOTDIR):
+            raise
+        raise BadInputError(
+            f"cannot write {folder}: {error.strerror}; make room or name another folder, then give the same command "
+            "again: it goes on where it was"
+        ) from error
+
+
+def _sources(paths: Sequence[Path]) -> list[dict[str, str]]:
+    return [{"name": path.name, "digest": episode_digest(path)} for path in paths]
+
+
+def _check_sources(sources: dict[str, list[dict[str, str]]]) -> None:
+    seen: dict[str, str] = {}
+    for name, items in sources.items():
+        if len(items) < 2:
+            raise BadInputError(f"the {name} set has {len(items)} drives; it needs one to train and one to test")
+        for item in items:
+            other = seen.setdefault(item["digest"], name)
+            if other != name or items.count(item) > 1:
+                raise BadInputError(
+                    f"drive {item['name']} serves the {other} set and again the {name} set; every drive serves once, "
+                    "and the policy set needs drives of its own (Sec. V-A)"
+                )
+
+
+@contextlib.contextmanager
+def _pool(processes: int) -> Iterator[ProcessPoolExecutor | None]:
+    if processes < 2:
+        yield None
+        return
+    context = multiprocessing.get_context("spawn")  # a fork would copy the threads' locks of torch and pyarrow
+    pool = ProcessPoolExecutor(processes, mp_context=context, initializer=_start_worker)
+    try:
+        yield pool
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _start_worker() -> None:
+    """Leave Ctrl-C to the parent, and end with it even when it is killed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+
+
+def _end_with(parent: multiprocessing.process.BaseProcess) -> None:
+    parent.join()
+    os._exit(1)
+
+
+def _results(
+    pool: ProcessPoolExecutor | None, function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]]
+) -> Iterator[tuple[int, Any]]:
+    """Task number and result, as they are finished."""
+    if pool is None:
+        for number, task in enumerate(tasks):
+            yield number, function(*task)
+        return
+    futures: dict[Future[Any], int] = {pool.submit(function, *task): number for number, task in enumerate(tasks)}
+    for future in as_completed(futures):
+        yield futures.pop(future), future.result()
+
+
+@dataclass(frozen=True)
+class _Build:
+    """One build: what goes in, where it goes."""
+
+    frames: FramesSettings
+    birdview: BirdviewSettings
+    paths: dict[str, Sequence[Path]]
+    sources: dict[str, list[dict[str, str]]]
+    folder: Path
+    given_key: str | None
+
+    @property
+    def inputs(self) -> str:
+        """Digest of all that decides the store's bytes."""
+        own = {"frames": self.frames.model_dump(mode="json", exclude={"unit"}), "sources": self.sources}
+        own |= {"birdview": self.birdview.model_dump(mode="json")}
+        return content_key("frames", own, (), FORMAT_VERSIONS["frames"])
+
+    @property
+    def draft(self) -> Path:
+        return self.folder.with_name(f".{self.folder.name}.building")
+
+    def finished(self) -> bool:
+        """Whether the folder holds the store of these inputs. Raises BadInputError when it holds something else."""
+        if not self.folder.exists():
+            return False
+        if open_frames(self.folder).manifest["inputs"] != self.inputs:
+            raise BadInputError(
+                f"{self.folder} holds frames of other settings or drives; delete it or name another folder"
+            )
+        return True
+
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[None]:
+        """Wait for another process that builds the same folder."""
+        path = self.folder.with_name(f".{self.folder.name}.lock")
+        with path.open("w") as stream:
+            fcntl.flock(stream, fcntl.LOCK_EX)
+            yield
+            path.unlink(missing_ok=True)
+
+    def run(self, pool: ProcessPoolExecutor | None, progress: Progress) -> None:
+        plan = self._plan(pool, progress)
+        self._allocate(plan)
+        parts = self._render(pool, plan, progress)
+        manifest = {
+            "schema_version": SCHEMA_VERSION,
+            "key": self.given_key or self.inputs,
+            "inputs": self.inputs,
+            "digest": content_key("store", [parts[name] for name in SETS], (), SCHEMA_VERSION),
+            "settings": {
+                "frames": self.frames.model_dump(mode="json", exclude={"unit"}),
+                "birdview": self.birdview.model_dump(mode="json"),
+            },
+            "sources": self.sources,
+            "sets": {
+                name: plan[name]
+                | {
+                    "arrays": {
+                        key: {"shape": [plan[name]["frames"], *shape], "dtype": "uint8"}
+                        for key, shape in SHAPES.items()
+                    },
+                    "parts": parts[name],
+                }
+                for name in SETS
+            },
+        }
+        _write_json(self.draft / "manifest.json", manifest)
+        self.draft.rename(self.folder)
+        for left in ("plan.json", "journal"):
+            (self.folder / left).unlink()
+
+    def _plan(self, pool: ProcessPoolExecutor | None, progress: Progress) -> dict[str, Any]:
+        """Choose the frames, or take up the choice of a build that was killed. The draft holds the labels then."""
+        path = self.draft / "plan.json"
+        if path.is_file():
+            plan: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+            if plan["inputs"] == self.inputs:
+                return plan
+        if self.draft.exists():
+            shutil.rmtree(self.draft)
+        self._check_room()
+        tasks = [
+            (path, number, name, self.frames, self.birdview)
+            for name in SETS
+            for number, path in enumerate(self.paths[name])
+        ]
+        tables: list[dict[str, NDArray[Any]]] = [{}] * len(tasks)
+        for done, (number, table) in enumerate(_results(pool, _candidates, tasks)):
+            tables[number] = table
+            progress("select", done + 1, len(tasks))
+        plan = {"inputs": self.inputs}
+        first = 0
+        for name, wanted in (("encoder", self.frames.encoder), ("policy", self.frames.policy)):
+            last = first + len(self.paths[name])
+            columns = {key: np.concatenate([table[key] for table in tables[first:last]]) for key in LABELS.names}
+            first = last
+            rows, train, test_drives = _choose(columns, name, wanted, len(self.paths[name]), self.frames)
+            before = _balance(columns, np.ones(len(columns["step"]), bool))
+            chosen = {key: values[rows] for key, values in columns.items()} | {"train": train}
+            (self.draft / name).mkdir(parents=True)
+            table = pa.table({key: pa.array(chosen[key]) for key in LABELS.names}, schema=LABELS)
+            pq.write_table(table, self.draft / name / "labels.parquet", compression="zstd")
+            plan[name] = {
+                "frames": len(rows),
+                "train": int(train.sum()),
+                "test": int((~train).sum()),
+                "test_drives": test_drives,
+                "labels": file_digest(self.draft / name / "labels.parquet"),
+                "candidates": before,
+                "chosen": {"all": _balance(chosen, np.ones(len(rows), bool))}
+                | {split: _balance(chosen, train == (split == "train")) for split in ("train", "test")},
+            }
+        _write_json(path, plan)
+        return plan
+
+    def _check_room(self) -> None:
+        each = sum(int(np.prod(shape)) for shape in SHAPES.values()) + 60
+        need = (self.frames.encoder + self.frames.policy) * each
+        free = shutil.disk_usage(self.folder.parent).free
+        if need > free:
+            raise BadInputError(
+                f"{self.folder.parent} has {free / 1e9:.2f} GB free and the frames need {need / 1e9:.2f} GB: free some "
+                "room, name another folder, or lower --frames.encoder and --frames.policy"
+            )
+
+    def _allocate(self, plan: dict[str, Any]) -> None:
+        """Take the whole room at once, so that a full disk shows now and not in an hour."""
+        for name in SETS:
+            for key, shape in SHAPES.items():
+                path = self.draft / name / f"{key}.npy"
+                whole = (plan[name]["frames"], *shape)
+                size = _header(whole) + int(np.prod(whole))
+                if path.is_file() and path.stat().st_size == size:
+                    continue
+                np.lib.format.open_memmap(path, mode="w+", dtype=np.uint8, shape=whole)
+                with path.open("r+b") as stream:
+                    os.posix_fallocate(stream.fileno(), 0, size)
+
+    def _render(
+        self, pool: ProcessPoolExecutor | None, plan: dict[str, Any], progress: Progress
+    ) -> dict[str, list[dict[str, Any]]]:
+        parts: dict[str, dict[int, dict[str, Any]]] = {name: {} for name in SETS}
+        for line in _journal(self.draft / "journal"):
+            parts[line["set"]][line["start"]] = line["part"]
+        tasks: list[tuple[Any, ...]] = []
+        for name in SETS:
+            labels = pq.read_table(self.draft / name / "labels.parquet", columns=["episode", "step", "agent"])
+            episode, step, agent = (labels.column(key).to_numpy() for key in ("episode", "step", "agent"))
+            starts = np.flatnonzero(np.diff(episode, prepend=-1))
+            for start, end in zip(starts.tolist(), [*starts[1:].tolist(), len(episode)], strict=True):
+                if start not in parts[name]:
+                    moments = np.stack([step[start:end], agent[start:end]], axis=1)
+                    task = (self.paths[name][episode[start]], self.birdview, moments, self.draft / name, start)
+                    tasks.append((*task, plan[name]["frames"]))
+        total = sum(plan[name]["frames"] for name in SETS)
+        done = sum(part["rows"] for name in SETS for part in parts[name].values())
+        progress("render", done, total)
+        with (self.draft / "journal").open("a") as journal:
+            for number, part in _results(pool, _render_part, tasks):
+                name = tasks[number][3].name
+                parts[name][part["start"]] = part
+                journal.write(json.dumps({"set": name, "start": part["start"], "part": part}) + "\n")
+                journal.flush()
+                done += part["rows"]
+                progress("render", done, total)
+        return {name: [parts[name][start] for start in sorted(parts[name])] for name in SETS}
+
+
+def _journal(path: Path) -> Iterator[dict[str, Any]]:
+    """Finished parts; a line that a kill has cut off ends them."""
+    if not path.is_file():
+        return
+    whole = path.read_text(encoding="utf-8")
+    end = whole.rfind("\n") + 1
+    if end < len(whole):
+        os.truncate(path, end)
+    for line in whole[:end].splitlines():
+        yield json.loads(line)
+
+
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    draft = path.with_suffix(".draft")
+    with draft.open("w", encoding="utf-8") as stream:
+        json.dump(content, stream, indent=1, allow_nan=False)
+        stream.flush()
+        os.fsync(stream.fileno())
+    draft.replace(path)
+
+
+def _header(shape: tuple[int, ...]) -> int:
+    """Bytes before the numbers in an .npy file of uint8."""
+    stream = io.BytesIO()
+    np.lib.format.write_array_header_1_0(stream, {"descr": "|u1", "fortran_order": False, "shape": shape})
+    return len(stream.getvalue())
+
+
+def _render_part(
+    path: Path, settings: BirdviewSettings, moments: NDArray[np.int32], folder: Path, start: int, frames: int
+) -> dict[str, Any]:
+    """Paint frames of one drive, [M, 2] of (step, agent id), into the rows from `start` on; runs in a worker."""
+    episode = read_episode(path)
+    positions = {agent.id: index for index, agent in enumerate(episode.agents)}
+    where = np.array([(step, positions[agent]) for step, agent in moments.tolist()])
+    renderer = Renderer(episode, settings)
+    digests = {name: hashlib.sha256() for name in SHAPES}
+    with contextlib.ExitStack() as stack:
+        streams = {name: stack.enter_context((folder / f"{name}.npy").open("r+b")) for name in SHAPES}
+        for name, shape in SHAPES.items():
+            streams[name].seek(_header((frames, *shape)) + start * int(np.prod(shape)))
+        for first in range(0, len(where), CHUNK):
+            for name, array in zip(SHAPES, renderer.render(where[first : first + CHUNK]), strict=True):
+                streams[name].write(array.data)
+                digests[name].update(array.data)
+        for stream in streams.values():
+            stream.flush()
+            os.fsync(stream.fileno())  # the journal must not know of rows that a power cut takes back
+    return {"start": start, "rows": len(where)} | {name: digest.hexdigest() for name, digest in digests.items()}
+
+
+# --- choosing -------------------------------------------------------------------------------------------------------
+
+
+def _candidates(
+    path: Path, number: int, name: str, frames: FramesSettings, birdview: BirdviewSettings
+) -> dict[str, NDArray[Any]]:
+    """Label columns of one drive's candidate moments; runs in a worker.
+
+    Of each vehicle every k-th moment is taken, k the spacing, from a random one on; for the encoder set a standing
+    moment is kept with probability `standing_weight`.
+    """
+    episode = read_episode(path)
+    rng = np.random.default_rng([frames.seed, _PHASE, SETS.index(name), number])
+    every = max(1, int(np.ceil(frames.spacing * RATE_HZ - 1e-9)))
+    phase = rng.integers(every, size=len(episode.agents))
+    moments = valid_moments(episode, birdview)
+    moments = moments[(moments[:, 0] - phase[moments[:, 1]]) % every == 0]
+    if name == "encoder":
+        moving = episode.speed[tuple(moments.T)] >= STANDING
+        moments = moments[moving | (rng.random(len(moments)) < frames.standing_weight)]
+    at = tuple(moments.T)
+    ids = np.array([agent.id for agent in episode.agents], np.int32)
+    return {
+        "episode": np.full(len(moments), number, np.int32),
+        "agent": ids[moments[:, 1]],
+        "step": moments[:, 0].astype(np.int32),
+        "train": np.ones(len(moments), bool),
+        "steering": episode.steering[at],
+        "acceleration": np.searchsorted(ACCELERATIONS, episode.acceleration[at]).astype(np.int8),
+        "speed": episode.speed[at],
+        "light": governing_light(episode, birdview, moments),
+        "light_distance": episode.light_distance[at],
+        "lead_gap": episode.lead_gap[at],
+        "standing": episode.speed[at] < STANDING,
+    }
+
+
+def _choose(
+    columns: dict[str, NDArray[Any]], name: str, wanted: int, drives: int, settings: FramesSettings
+) -> tuple[Indices, NDArray[np.bool_], list[int]]:
+    """Rows of the chosen candidates, sorted; which of them are for training; the test drives (Sec. V, PAPER.md 2.8)."""
+    rng = np.random.default_rng([settings.seed, _SPLIT, SETS.index(name)])
+    test = round(wanted * settings.test_share)
+    balance = settings.balance if name == "policy" else "none"
+    if settings.split == "frame":
+        rows = _sample(columns, np.arange(len(columns["step"])), wanted, balance, name, "", settings, rng)
+        train = np.ones(wanted, bool)
+        train[rng.permutation(wanted)[:test]] = False
+        return rows, train, []
+    count = min(max(1, round(drives * settings.test_share)), drives - 1)
+    test_drives = np.sort(rng.permutation(drives)[:count])
+    in_test = np.isin(columns["episode"], test_drives)
+    parts = [
+        _sample(columns, np.flatnonzero(pool), number, balance, name, f" {split}", settings, rng)
+        for pool, number, split in ((~in_test, wanted - test, "training"), (in_test, test, "test"))
+    ]
+    rows = np.sort(np.concatenate(parts))
+    return rows, ~in_test[rows], test_drives.tolist()
+
+
+def _sample(
+    columns: dict[str, NDArray[Any]],
+    pool: Indices,
+    wanted: int,
+    balance: str,
+    name: str,
+    split: str,
+    settings: FramesSettings,
+    rng: np.random.Generator,
+) -> Indices:
+    """`wanted` rows of the pool without replacement, sorted; raked to the target margins unless `balance` is none."""
+    if wanted > len(pool):
+        raise BadInputError(
+            f"the {name} set needs {wanted}{split} frames and its drives give {len(pool)}: raise "
+            f"--recording.{name}_episodes or --recording.duration, or lower --frames.{name} or --frames.spacing"
+        )
+    if balance == "none":
+        return np.sort(rng.permutation(pool)[:wanted])
+    cell, shape, margins = _cells(columns, pool, balance, settings)
+    available = np.bincount(cell, minlength=int(np.prod(shape))).reshape(shape)
+    counts = rake(available, margins, wanted, settings.weight_cap).reshape(-1)
+    order = np.lexsort((rng.random(len(pool)), cell))
+    first = np.searchsorted(cell[order], np.arange(len(counts)))
+    rank = np.arange(len(pool)) - first[cell[order]]
+    return np.sort(pool[order[rank < counts[cell[order]]]])
+
+
+def _cells(
+    columns: dict[str, NDArray[Any]], pool: Indices, balance: str, settings: FramesSettings
+) -> tuple[NDArray[np.intp], tuple[int, ...], dict[int, NDArray[np.float64]]]:
+    """Cell number of each row in (steering bin, class, standing), the cells' shape, and target shares by axis."""
+    shape = (len(STEERING_EDGES) + 1, len(ACCELERATIONS), 2)
+    bins = np.digitize(columns["steering"][pool], STEERING_EDGES)
+    cell = np.ravel_multi_index((bins, columns["acceleration"][pool], columns["standing"][pool].astype(int)), shape)
+    middle = len(STEERING_EDGES) // 2
+    steering = np.full(shape[0], (1 - settings.near_zero) / (shape[0] - 1))
+    steering[middle] = settings.near_zero
+    margins = {0: steering}
+    if balance == "all":
+        margins |= {1: np.full(3, 1 / 3), 2: np.array([1 - settings.standing, settings.standing])}
+    return cell, shape, margins
+
+
+def rake(
+    available: NDArray[np.integer[Any]], margins: dict[int, NDArray[np.float64]], wanted: int, cap: float
+) -> NDArray[np.int64]:
+    """How many to take of each cell's `available` so that `wanted` come as near to the target margins as they can.
+
+    Iterative proportional fitting, where no cell gives more than it has or more than `cap` times its proportional
+    share. `margins`: axis -> shares along it. Raises BadInputError when the cap leaves too few.
+    """
+    proportional = available * (wanted / max(int(available.sum()), 1))
+    most = np.minimum(available, np.ceil(cap * proportional))
+    if most.sum() < wanted:
+        raise BadInputError(
+            f"--frames.weight_cap {cap:g} lets {most.sum():.0f} of {wanted} frames be chosen; it must be 1 or more"
+        )
+    counts = np.minimum(proportional, most)
+    for _ in range(500):
+        for axis, shares in margins.items():
+            others = tuple(other for other in range(counts.ndim) if other != axis)
+            have = counts.sum(axis=others, keepdims=True)
+            target = wanted * np.expand_dims(shares, others)
+            counts = np.minimum(counts * (target / np.maximum(have, 1e-12)), most)
+    # Where the targets cannot be met, the rest comes from whatever is left, in proportion.
+    left = most - counts
+    if left.sum() > 0:
+        counts += left * (max(wanted - counts.sum(), 0) / left.sum())
+    whole: NDArray[np.int64] = np.floor(counts + 1e-9).astype(np.int64)
+    missing = wanted - int(whole.sum())
+    rest = np.where(whole < most, counts - whole, -1.0).reshape(-1)
+    whole.reshape(-1)[np.argsort(-rest, kind="stable")[:missing]] += 1
+    return whole
+
+
+def _balance(columns: dict[str, NDArray[Any]], rows: NDArray[np.bool_]) -> dict[str, Any]:
+    """What a reader must know of a set's labels: histograms, and the accuracy of always saying the commonest class."""
+    steering, standing = columns["steering"][rows], columns["standing"][rows]
+    classes = np.bincount(columns["acceleration"][rows], minlength=len(ACCELERATIONS))
+    number = max(int(rows.sum()), 1)
+    return {
+        "frames": int(rows.sum()),
+        "drives": len(np.unique(columns["episode"][rows])),
+        "steering_edges": list(STEERING_EDGES),
+        "steering": np.bincount(np.digitize(steering, STEERING_EDGES), minlength=len(STEERING_EDGES) + 1).tolist(),
+        "acceleration": classes.tolist(),
+        "standing": int(standing.sum()),
+        "light": np.bincount(columns["light"][rows], minlength=3).tolist(),
+        "majority_accuracy": float(classes.max() / number),
+        "steering_beyond_crop": float((np.abs(steering) > STEERING_CROP).sum() / number),
+    }
