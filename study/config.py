@@ -192,7 +192,8 @@ class Rules(Settings):
     )
     reach_slack: Share = Field(0.1, description="how much later than the text says, as a share of all epochs")
     spread_factor: Annotated[float, Field(ge=1)] = Field(
-        1.5, description="what two encoders may differ in the variance of their policies, with one encoder for each cell"
+        1.5,
+        description="what two encoders may differ in the variance of their policies, with one encoder for each cell",
     )
 
 
@@ -326,6 +327,7 @@ def parameter_counts() -> dict[str, int]:
 # --- files ----------------------------------------------------------------------------------------------------------
 
 SWEEPS = Path("sweeps")
+DEFAULT_TRACKING = "sqlite:///mlruns/mlflow.db"
 
 
 def read_yaml(path: Path) -> dict[str, Any]:

@@ -10,15 +10,17 @@ import argparse
 import fcntl
 import json
 import os
+import signal
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from study.command import GRID_OPTIONS, Parser, add_options, grid_overrides, run, study_overrides
 from study.config import (
+    DEFAULT_TRACKING,
     HEADS,
     SWEEPS,
     BadInputError,
@@ -36,7 +38,6 @@ from study.config import (
 from study.cost import Cost, cell_cost, clock, data_cost, size, total
 from study.data import DATA, frames_folder, prepare
 
-DEFAULT_TRACKING = "sqlite:///mlruns/mlflow.db"
 EXIT_FAILED, EXIT_INTERRUPTED = 1, 130
 
 
@@ -107,6 +108,7 @@ def main(args: Sequence[str]) -> int:
         raise BadInputError(f"--workers is {options.workers}; it must be 1 or more")
     if options.dry_run:
         return dry_run(plan, options.tracking, as_json=options.json)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # a batch system's stop ends as cleanly as Ctrl-C
     with only_sweep(Path("mlruns") / "sweep.lock"):
         try:
             return execute(plan, options)
@@ -224,15 +226,19 @@ def execute(plan: Plan, options: argparse.Namespace) -> int:
         manifest = frames / "manifest.json"
         data = json.loads(manifest.read_text(encoding="utf-8")) if manifest.is_file() else {}
         sweep_run = tracker.open_sweep(plan.grid, plan.profile, plan.settings, plan.cells, data, provenance())
+        status: Literal["FINISHED", "FAILED", "KILLED"] = "KILLED"
         queue = Queue(f"{plan.grid.name} {plan.profile} {plan.key}", plan.cells)
         queue.plan(waiting)
         jobs = {
             key: CellJob(plan.cells[key], key, plan.settings, plan.grid.policy_seeds, frames, DATA, options.device)
             for key in waiting
         }
-        with Workers(jobs, options.workers, tracker, sweep_run, queue, display) as workers:
-            failed = workers.run()
-        tracker.close_sweep(sweep_run, "FAILED" if failed else "FINISHED")
+        try:
+            with Workers(jobs, options.workers, tracker, sweep_run, queue, display) as workers:
+                failed = workers.run()
+            status = "FAILED" if failed else "FINISHED"
+        finally:
+            tracker.close_sweep(sweep_run, status)
         if not options.no_report:
             display.say("writing the report")
             from study.report import publish  # noqa: PLC0415

@@ -122,6 +122,10 @@ class Workers:
     def _start(self, ticket: Ticket) -> None:
         job = dataclasses.replace(self._jobs[ticket.key], threads=self._threads, slot=self._slots.pop(0))
         run = self._tracker.start_cell(self._sweep_run, job.cell, job.key, job.settings, job.policy_seeds)
+        if job.result_folder.is_dir():  # trained before; only the commit was cut off
+            self._slots.append(job.slot)
+            self._commit(job, ticket, run)
+            return
         here, there = multiprocessing.Pipe(duplex=False)
         context = multiprocessing.get_context("spawn")
         process = context.Process(target=serve, args=(job, there), name=job.cell.label, daemon=True)
@@ -150,11 +154,7 @@ class Workers:
         key = worker.job.key
         match worker.outcome:
             case ("done",):
-                result = CellResult.load(worker.job.result_folder)
-                self._tracker.commit(worker.run, result)
-                self._queue.done(worker.ticket, _score(result))
-                shutil.rmtree(worker.job.result_folder)
-                self._display.finish(key)
+                self._commit(worker.job, worker.ticket, worker.run)
                 return
             case ("failed", passing, reason):
                 pass
@@ -169,6 +169,13 @@ class Workers:
             self._queue.failed(worker.ticket, reason)
             self._failed[key] = reason
             self._display.fail(key)
+
+    def _commit(self, job: CellJob, ticket: Ticket, run: CellRun) -> None:
+        result = CellResult.load(job.result_folder)
+        self._tracker.commit(run, result)
+        self._queue.done(ticket, _score(result))
+        shutil.rmtree(job.result_folder)
+        self._display.finish(job.key)
 
 
 def _score(result: CellResult) -> float:
