@@ -59,7 +59,8 @@ def prepare(settings: StudySettings, root: Path, processes: int, progress: Progr
         drives[split:],
         folder,
         processes,
-        lambda _, done, whole: progress("render", done, whole),
+        lambda stage, done, whole: progress(stage, done, whole) if stage == "render" else None,
+        key=frames_key(settings),
     )
     return folder
 
