@@ -1,0 +1,361 @@
+"""The expert: planned routes and the CARLA autopilot's rule (PAPER.md 2.6), for all vehicles of a town at once.
+
+N vehicles; arrays have one entry for each. Everything is computed for the whole fleet with numpy, because a step of a
+hundred vehicles is then hardly dearer than a step of one. Distances along a route are measured at the vehicle's
+centre; gaps and distances to a stop line from the front bumper.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from study.config import ACCELERATIONS
+from study.episode import GREEN, RED, YELLOW
+from study.sim.town import Town
+
+DT = 0.1  # [s]
+LENGTH, WIDTH = 5.0, 2.0  # of every vehicle [m], highway-env's
+STEERING_UNIT = 2.4  # wheel angle [rad] of a steering label of one
+THROTTLE = {0.5: 1.0, 1.0: 2.5}  # [m/s2] at rest, fading with speed
+TOP_SPEED = 25.0  # where the throttle has faded to nothing [m/s]
+BRAKE = 5.0  # [m/s2]
+LOOK = 30.0  # how far ahead a vehicle on the route is noticed [m]
+REACH = LOOK + 8.0  # from centre to centre, so that nobody in the look-ahead is missed [m]
+MARGIN = 0.1  # added on both sides of the vehicle when its way is tested [m]
+
+KP_LATERAL, KP_HEADING = 1 / 0.6, 1 / 0.2  # gains of highway-env's steering control [1/s]
+SLOWEST = 3.0  # steering control divides by the speed: standing cars would turn their wheels wildly [m/s]
+MOST_STEERING = np.pi / 3  # [rad]
+
+SPACING = 0.5  # of the samples of a planned way [m]
+SAMPLES = 512  # kept of each vehicle's way
+AHEAD, BEHIND = 70.0, 10.0  # of the vehicle, at least kept [m]
+GAP = 7.5  # of street that a waiting vehicle takes [m]
+GAP_MARGIN = 0.8  # a turning vehicle leaves the crossing lane so long before the other arrives [s]
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Decisions:
+    """What every vehicle did in one step and what it saw when it decided; [N] arrays.
+
+    `steering`: label, wheel angle over STEERING_UNIT, positive to the left. `acceleration`: one of ACCELERATIONS.
+    `light`: next signal on the route, -1 for none. `light_distance`: centre to its stop line along the route [m].
+    `lead_gap`: free way from the front bumper along the route [m], inf where nothing is within LOOK.
+    `lateral`, `heading_error`: from the planned way, to the right [m, rad]; `curvature` of the way [1/m].
+    """
+
+    steering: Floats
+    acceleration: Floats
+    light: Ints
+    light_distance: Floats
+    route_s: Floats
+    lead_gap: Floats
+    lateral: Floats
+    heading_error: Floats
+    curvature: Floats
+
+
+class Fleet:
+    """The autopilot's memory: where every vehicle is on its planned route, and what it has made up its mind to."""
+
+    def __init__(self, town: Town, vehicles: int, brake_hold: float, rng: np.random.Generator) -> None:
+        self.town, self.rng = town, rng
+        self.hold_steps = round(brake_hold / DT)
+        self.limits = np.array([strip.limit for strip in town.strips])
+        self.starts: list[list[float]] = [[] for _ in range(vehicles)]  # along the route, of its strips
+        self.routes: list[list[int]] = [[] for _ in range(vehicles)]  # strips
+        self.turns: list[list[tuple[int, float]]] = [[] for _ in range(vehicles)]  # signalled movements ahead
+        self.ends = np.zeros(vehicles)  # of the planned route
+        self.sampled = np.zeros(vehicles, np.int64)  # strips of the route that are in `x` and so on
+        self.x, self.y, self.heading, self.curvature = np.zeros((4, vehicles, SAMPLES))
+        self.first = np.zeros(vehicles, np.int64)  # number along the route of the first sample kept
+        self.filled = np.zeros(vehicles, np.int64)  # samples kept
+        self.s = np.zeros(vehicles)
+        self.lateral = np.zeros(vehicles)
+        self.at = np.zeros(vehicles, np.int64)  # position in `routes` of the strip that the vehicle is on
+        self.strip = np.zeros(vehicles, np.int64)
+        self.strip_start, self.strip_end = np.zeros((2, vehicles))
+        self.move = np.full(vehicles, -1)  # next or present signalled movement, -1 for none
+        self.move_start, self.move_end = np.full((2, vehicles), np.inf)
+        self.stopping = np.zeros(vehicles, bool)  # for the light ahead
+        self.running = np.zeros(vehicles, bool)  # a yellow that came too late
+        self.held = np.zeros(vehicles, bool)  # before a junction that has no room behind it
+        self.since = np.zeros(vehicles, np.int64)  # step at which the junction was entered
+        self.brake_until = np.zeros(vehicles, np.int64)
+        moves = town.movements
+        self.move_exit = np.array([move.exit for move in moves], np.int64)
+        self.move_left = np.array([move.turn == "left" for move in moves], bool)
+        self.move_signal = np.array([town.signal_of[move.entry] for move in moves], np.int64)
+        self.move_length = np.array([move.length for move in moves])
+        self.street_length = np.array([strip.piece.length for strip in town.strips])
+        across = np.where(town.opposing, town.enter, np.inf)
+        self.first_crossing = np.nan_to_num(across, nan=np.inf).min(axis=1, initial=np.inf)
+
+    # --- routes -----------------------------------------------------------------------------------------------------
+
+    def place(self, slot: int, strip: int, s: float) -> None:
+        """Give a vehicle a new route that starts on a street's strip, with the vehicle at `s` [m] of it."""
+        self.routes[slot], self.starts[slot], self.turns[slot] = [], [], []
+        self.ends[slot] = self.sampled[slot] = self.first[slot] = self.filled[slot] = self.at[slot] = 0
+        self.s[slot], self.lateral[slot] = s, 0.0
+        self.stopping[slot] = self.running[slot] = self.held[slot] = False
+        self.brake_until[slot] = 0
+        self.move[slot] = -1
+        self._append(slot, strip)
+        self._lengthen(slot)
+        self._stand_on(slot)
+        self._next_turn(slot)
+
+    def _append(self, slot: int, strip: int) -> None:
+        self.routes[slot].append(strip)
+        self.starts[slot].append(float(self.ends[slot]))
+        self.ends[slot] += self.street_length[strip]
+
+    def _lengthen(self, slot: int) -> None:
+        """Plan further where the plan gets short, and sample the way as far as it may be looked at."""
+        signalled = bool(self.town.signals)
+        while self.ends[slot] < self.s[slot] + AHEAD + 60 or (signalled and len(self.turns[slot]) < 2):
+            ways = self.town.ways[self.routes[slot][-1]]
+            number = ways[int(self.rng.integers(len(ways)))]
+            movement = self.town.movements[number]
+            if self.town.phases[movement.node]:
+                self.turns[slot].append((number, float(self.ends[slot])))
+            for strip in (*movement.strips, movement.exit):
+                self._append(slot, strip)
+        spare = int(self.s[slot] / SPACING) - int(BEHIND / SPACING) - int(self.first[slot])
+        if 0 < spare < self.filled[slot]:
+            kept = int(self.filled[slot]) - spare
+            for values in (self.x, self.y, self.heading, self.curvature):
+                values[slot, :kept] = values[slot, spare : spare + kept]
+            self.first[slot] += spare
+            self.filled[slot] = kept
+        while (self.first[slot] + self.filled[slot]) * SPACING < self.s[slot] + AHEAD + 60:
+            self._sample(slot, int(self.sampled[slot]))
+            self.sampled[slot] += 1
+
+    def _sample(self, slot: int, number: int) -> None:
+        start, filled = self.starts[slot][number], int(self.filled[slot])
+        piece = self.town.strips[self.routes[slot][number]].piece
+        begin = int(self.first[slot]) + filled
+        count = max(int(np.ceil((start + piece.length) / SPACING)) - begin, 0)
+        x, y, heading = piece.at(np.arange(begin, begin + count, dtype=np.float64) * SPACING - start)
+        if filled:  # headings go on without jumps, so that they can be interpolated
+            heading = heading + 2 * np.pi * round((self.heading[slot, filled - 1] - piece.heading) / (2 * np.pi))
+        new = slice(filled, filled + count)
+        self.x[slot, new], self.y[slot, new], self.heading[slot, new] = x, y, heading
+        self.curvature[slot, new] = piece.curvature
+        self.filled[slot] += count
+
+    def _stand_on(self, slot: int) -> None:
+        at = int(self.at[slot])
+        self.strip[slot] = self.routes[slot][at]
+        self.strip_start[slot] = self.starts[slot][at]
+        self.strip_end[slot] = self.starts[slot][at + 1]
+
+    def _next_turn(self, slot: int) -> None:
+        if self.turns[slot]:
+            number, start = self.turns[slot].pop(0)
+            self.move[slot], self.move_start[slot] = number, start
+            self.move_end[slot] = start + self.move_length[number]
+
+    def follow(self, x: Floats, y: Floats) -> None:
+        """Find every vehicle on its planned way, and plan ahead."""
+        rows = np.arange(len(x))
+        near = (self.s / SPACING).astype(np.int64) - self.first
+        window = (near[:, None] + np.arange(-3, 7)).clip(0)
+        dx, dy = x[:, None] - self.x[rows[:, None], window], y[:, None] - self.y[rows[:, None], window]
+        best = (dx * dx + dy * dy).argmin(axis=1)
+        k = window[rows, best]
+        dx, dy, heading = dx[rows, best], dy[rows, best], self.heading[rows, k]
+        c, s = np.cos(heading), np.sin(heading)
+        self.s = (self.first + k) * SPACING + dx * c + dy * s
+        self.lateral = dy * c - dx * s
+        for slot in np.flatnonzero(self.s > self.strip_end).tolist():
+            self.at[slot] += 1
+            self._stand_on(slot)
+        for slot in np.flatnonzero(self.s - LENGTH / 2 > self.move_end).tolist():
+            self._next_turn(slot)
+            self.running[slot] = self.stopping[slot] = self.held[slot] = False
+        short = (self.first + self.filled) * SPACING < self.s + AHEAD
+        for slot in np.flatnonzero(short | (self.strip_end + 40 > self.ends)).tolist():
+            self._lengthen(slot)
+
+    def ahead(self, values: Floats, distance: Floats) -> Floats:
+        """A sampled quantity, interpolated at `distance` [m] ahead."""
+        rows = np.arange(len(distance))
+        place = (self.s + distance) / SPACING - self.first
+        k = np.floor(place).astype(np.int64)
+        low = values[rows, k]
+        return low + (place - k) * (values[rows, k + 1] - low)
+
+    # --- the rule ---------------------------------------------------------------------------------------------------
+
+    def decide(
+        self,
+        step: int,
+        pose: tuple[Floats, Floats, Floats, Floats],
+        pairs: tuple[Ints, Ints],
+        lights: NDArray[np.uint8],
+    ) -> Decisions:
+        """Every vehicle's command from `pose` (x, y, heading, speed) after `follow`.
+
+        `pairs`: each (i, j), sorted, of vehicles within at least REACH of each other; `lights`: states of the signals.
+        """
+        _, _, heading, speed = pose
+        lead_gap, lead = self._lead(pose, pairs)
+        front = self.s + LENGTH / 2 - self.move_start  # of the bumper, from the stop line; -inf without a light
+        state = self._heed_lights(front, speed, lights)
+        crossing = self._right_of_way(step, front, speed, state, lead_gap, lead)
+        gap = np.minimum(np.minimum(lead_gap, crossing), self._room_behind(front, speed))
+        kmh = speed * 3.6
+        limit = self.limits[self.strip] * 3.6
+        ray = np.maximum(0.5, kmh * kmh / 100) + 2
+        brake = (kmh >= limit) | self.stopping | (gap < ray)
+        fresh = brake & (step >= self.brake_until)
+        self.brake_until[fresh] = step + self.hold_steps
+        brake |= step < self.brake_until
+        low, middle, high = ACCELERATIONS
+        acceleration = np.where(brake, low, np.where(kmh >= limit - 10, middle, high))
+        error, curvature, wheel = self._steer(heading, speed)
+        known = (self.move >= 0) & (self.s <= self.move_start)
+        return Decisions(
+            steering=-wheel / STEERING_UNIT,
+            acceleration=acceleration,
+            light=np.where(known, self.move_signal[self.move], -1)
+            if len(self.move_signal)
+            else np.full(len(speed), -1),
+            light_distance=np.where(known, self.move_start - self.s, np.nan),
+            route_s=self.s.copy(),
+            lead_gap=lead_gap,
+            lateral=self.lateral.copy(),
+            heading_error=error,
+            curvature=curvature,
+        )
+
+    def _steer(self, heading: Floats, speed: Floats) -> tuple[Floats, Floats, Floats]:
+        """highway-env's cascade of lateral and heading control, with the way's curvature fed forward."""
+        v = np.maximum(speed, SLOWEST)
+        curvature = self.ahead(self.curvature, speed * DT)
+        course = self.ahead(self.heading, speed * DT) - np.arcsin(curvature * LENGTH / 2)  # the body points inwards
+        aside = np.arcsin((-KP_LATERAL * self.lateral / v).clip(-1, 1)).clip(-np.pi / 4, np.pi / 4)
+        error = np.mod(course + aside - heading + np.pi, 2 * np.pi) - np.pi
+        rate = v * curvature + KP_HEADING * error
+        slip = np.arcsin((LENGTH / 2 / v * rate).clip(-1, 1))
+        wheel = np.arctan(2 * np.tan(slip)).clip(-MOST_STEERING, MOST_STEERING)
+        return error, curvature, wheel
+
+    def _lead(self, pose: tuple[Floats, Floats, Floats, Floats], pairs: tuple[Ints, Ints]) -> tuple[Floats, Ints]:
+        """Free way before each bumper [m], inf beyond LOOK, and who ends it (-1: nobody)."""
+        x, y, heading, _ = pose
+        i, j = pairs
+        near = np.floor(self.s / SPACING).astype(np.int64) - self.first
+        rows = np.arange(len(x))
+        middle = near + round(17 / SPACING)
+        close = np.hypot(x[j] - self.x[rows, middle][i], y[j] - self.y[rows, middle][i]) < 20.5
+        i, j = i[close], j[close]
+        window = near[:, None] + np.arange(2, round((LOOK + LENGTH / 2 + 2) / SPACING), 2)
+        px, py = self.x[rows[:, None], window], self.y[rows[:, None], window]
+        dx, dy = px[i] - x[j][:, None], py[i] - y[j][:, None]
+        c, s = np.cos(heading)[j][:, None], np.sin(heading)[j][:, None]
+        along = np.maximum(np.abs(dx * c + dy * s) - LENGTH / 2, 0)
+        aside = np.maximum(np.abs(dy * c - dx * s) - WIDTH / 2, 0)
+        away = along * along + aside * aside
+        width = WIDTH / 2 + MARGIN
+        hit = away < width * width
+        hits = hit.any(axis=1)
+        i, j, away, k = i[hits], j[hits], np.sqrt(away[hits]), hit[hits].argmax(axis=1)
+        pair = np.arange(len(i))
+        before, after = away[pair, np.maximum(k - 1, 0)], away[pair, k]
+        part = np.where(k > 0, (before - width) / np.maximum(before - after, 1e-9), 1.0)
+        where = window[i, k] + 2 * (part - 1) + self.first[i]
+        distance = where * SPACING - self.s[i] + width - LENGTH / 2
+        order = np.lexsort((distance, i))
+        i, j, distance = i[order], j[order], distance[order]
+        nearest = np.ones(len(i), bool)
+        nearest[1:] = i[1:] != i[:-1]
+        gap, lead = np.full(len(x), np.inf), np.full(len(x), -1)
+        gap[i[nearest]], lead[i[nearest]] = distance[nearest], j[nearest]
+        gap[gap > LOOK] = np.inf
+        return gap, lead
+
+    def _heed_lights(self, front: Floats, speed: Floats, lights: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Make up or keep each mind about the light ahead; returns the state that each vehicle faces."""
+        state = np.full(len(front), GREEN, np.uint8)
+        ruled = self.move >= 0
+        state[ruled] = lights[self.move_signal[self.move[ruled]]]
+        before = ruled & (front <= 0)
+        bound = before & (state != GREEN)
+        way = speed * speed / (2 * BRAKE)
+        fresh = bound & ~self.stopping & ~self.running & (-front <= way + 0.2 * speed + 2.5)
+        late = fresh & (state == YELLOW) & (-front < way)
+        self.running = (self.running & ruled & (front <= 0) & (state != GREEN)) | late
+        self.stopping = (self.stopping & bound) | (fresh & ~late)
+        return np.where(before, state, np.where(ruled, GREEN, RED)).astype(np.uint8)
+
+    def _right_of_way(
+        self, step: int, front: Floats, speed: Floats, state: NDArray[np.uint8], lead_gap: Floats, lead: Ints
+    ) -> Floats:
+        """Distance from each bumper to where the vehicle has to let others pass [m], inf where it need not."""
+        town, gap = self.town, np.full(len(front), np.inf)
+        if not len(self.move_length):
+            return gap
+        inside = (self.move >= 0) & (front > 0)
+        self.since = np.where(inside, np.minimum(self.since, step), step)
+        goes = inside | self.running | ((state == GREEN) & ~self.held)
+        waits = (self.move >= 0) & (front > -45)
+        one, other = np.flatnonzero(waits), np.flatnonzero(waits & goes)
+        table = town.enter[self.move[one][:, None], self.move[other][None]]
+        found = np.nonzero(~np.isnan(table))
+        i, j = one[found[0]], other[found[1]]
+        a, b = self.move[i], self.move[j]
+        into_i, out_i, into_j, out_j = town.enter[a, b], town.leave[a, b], town.enter[b, a], town.leave[b, a]
+        open_ = (front[i] - LENGTH < out_i) & (front[j] - LENGTH < out_j) & (front[i] <= into_i)
+        taken = (front[j] > into_j) & open_
+        across = town.opposing[a, b]
+        yields = across & self.move_left[a] & ~self.move_left[b]
+        # across: the left turn waits for whoever can be there before it is through
+        stuck = (lead[j] >= 0) & (lead_gap[j] < into_j - front[j]) & (speed[lead[j]] < 2)
+        soon = _time(into_j - front[j], speed[j], 2.5, 12.0) < GAP_MARGIN + _time(
+            out_i + LENGTH - front[i], speed[i], 1.7, 9.0
+        )
+        crossing = self.first_crossing[a]
+        turn = yields & (front[i] <= crossing) & (taken | (open_ & soon & ~stuck))
+        # from the side: who is inside goes first, the others wait behind their stop line
+        older = ~across & open_ & (inside[j] | self.running[j])
+        line = older & ~inside[i]
+        rank = (self.since[j] < self.since[i]) | ((self.since[j] == self.since[i]) & (j < i))
+        meet = (older & inside[i] & (taken | rank)) | (across & ~yields & taken)
+        for where, distance in ((turn, crossing), (line, np.zeros(len(i))), (meet, into_i)):
+            np.minimum.at(gap, i[where], distance[where] - front[i[where]])
+        return gap
+
+    def _room_behind(self, front: Floats, speed: Floats) -> Floats:
+        """Distance to the stop line [m] for those whose street behind the junction is full, inf for the others."""
+        room = self.street_length.copy()
+        np.minimum.at(room, self.strip, self.s - self.strip_start - LENGTH / 2 + speed * speed / (2 * BRAKE))
+        ruled = self.move >= 0
+        gap = np.full(len(front), np.inf)
+        if not ruled.any():
+            return gap
+        way_out = self.move_exit[self.move]
+        coming = ruled & (front > 0) & (self.strip != way_out)
+        taken = np.bincount(way_out[coming], minlength=len(room))
+        self.held = ruled & (front <= 0) & (room[way_out] < GAP * (taken[way_out] + 1))
+        gap[self.held] = -front[self.held]
+        return gap
+
+
+def _time(distance: Floats, speed: Floats, acceleration: float, top: float) -> Floats:
+    """Time to cover a distance when accelerating up to the top speed [s]; 0 for a distance behind."""
+    distance, speed = np.maximum(distance, 0), np.minimum(speed, top)
+    ramp = (top - speed) / acceleration
+    on_ramp = (speed + top) / 2 * ramp
+    short = (np.sqrt(speed * speed + 2 * acceleration * distance) - speed) / acceleration
+    return np.where(distance < on_ramp, short, ramp + (distance - on_ramp) / top)

@@ -1,0 +1,242 @@
+"""TownEnv: the town as a gymnasium environment on highway-env, registered as `study/Town-v0` (Sec. IV-A)."""
+
+from __future__ import annotations
+
+from typing import Any, SupportsFloat
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from highway_env.envs.common.abstract import AbstractEnv
+from highway_env.envs.common.action import ActionType
+from highway_env.envs.common.observation import ObservationType
+
+from study.config import ACCELERATIONS, BadInputError, TownSettings
+from study.episode import GREEN
+from study.sim.autopilot import BRAKE, DT, LENGTH, LOOK, REACH, STEERING_UNIT, THROTTLE, TOP_SPEED, Decisions, Fleet
+from study.sim.lights import LightPlan, plan_lights
+from study.sim.road import TownNetwork, TownRoad, TownVehicle
+from study.sim.town import Town, draw_town
+
+EGO = 0  # position of the ego among the vehicles
+APART = 14.0  # vehicles start at least so far from each other [m]
+START_SPEED = 5.0  # [m/s]
+OFF_ROUTE = 4.0  # an ego farther than this from its way has lost it [m]
+CURVATURES = (5.0, 10.0, 20.0)  # where the ego looks at its way [m]
+
+
+class Traffic(TownRoad):
+    """The town's road with its lights and its autopilot: decides for everybody, then lets highway-env move them."""
+
+    def __init__(
+        self, town: Town, settings: TownSettings, rng: np.random.Generator, *, fast: bool, lights: LightPlan
+    ) -> None:
+        super().__init__(network=TownNetwork(town, fast=fast), np_random=rng)
+        self.town, self.lights = town, lights
+        self.fleet = Fleet(town, settings.vehicles, settings.brake_hold, rng)
+        self.steps = 0
+        self.agents: list[int] = []  # of each vehicle; one that is taken away and its successor differ
+        self.commands: dict[int, tuple[float, float]] = {}  # vehicle -> (acceleration, steering) for this step
+        self.collisions = 0
+        self.collided = 0  # vehicles
+        self.decisions: Decisions
+        streets = [k for k, strip in enumerate(town.strips) if k in town.ways and strip.piece.length > 2 * APART]
+        self.streets = np.array(streets or sorted(town.ways), np.int64)
+        for slot in range(settings.vehicles):
+            self._enter(slot)
+        self._follow()
+
+    @property
+    def time(self) -> float:
+        """Seconds since the start."""
+        return self.steps * DT
+
+    def _enter(self, slot: int) -> None:
+        """Put a new vehicle on a free spot of some street, in place of the one in `slot`, if there is one."""
+        others = np.array([v.position for k, v in enumerate(self.vehicles) if k != slot]).reshape(-1, 2)
+        best, most = (int(self.streets[0]), APART), -1.0
+        for _ in range(200):
+            strip = int(self.np_random.choice(self.streets))
+            piece = self.town.strips[strip].piece
+            s = float(self.np_random.uniform(LENGTH, max(piece.length - APART, LENGTH + 1)))
+            x, y, _ = piece.at(np.array([s]))
+            free = float(np.hypot(others[:, 0] - x, others[:, 1] - y).min(initial=np.inf))
+            if free > most:
+                best, most = (strip, s), free
+            if free > APART:
+                break
+        strip, s = best
+        x, y, heading = self.town.strips[strip].piece.at(np.array([s]))
+        vehicle = TownVehicle(self, [float(x[0]), float(y[0])], float(heading[0]), START_SPEED)
+        self.fleet.place(slot, strip, s)
+        if slot < len(self.vehicles):
+            self.vehicles[slot] = vehicle
+            self.agents[slot] = max(self.agents) + 1
+        else:
+            self.vehicles.append(vehicle)
+            self.agents.append(slot)
+
+    def _follow(self) -> None:
+        x, y, _, _ = self.pose()
+        self.fleet.follow(x, y)
+
+    def act(self) -> None:
+        """Decide every vehicle's command; one in `commands` has it from there."""
+        pose = self.pose()
+        self.light_states = self.lights.states(self.time)
+        decisions = self.fleet.decide(self.steps, pose, self.pairs_within(REACH), self.light_states)
+        for slot, (acceleration, steering) in self.commands.items():
+            decisions.acceleration[slot], decisions.steering[slot] = acceleration, steering
+        self.decisions = decisions
+        speed = pose[3]
+        push = np.where(decisions.acceleration == ACCELERATIONS[1], THROTTLE[0.5], THROTTLE[1.0])
+        force = np.where(
+            decisions.acceleration == ACCELERATIONS[0],
+            np.maximum(-BRAKE, -speed / DT),  # never backwards
+            push * (1 - speed / TOP_SPEED),
+        )
+        wheel = -decisions.steering * STEERING_UNIT
+        for vehicle, one, other in zip(self.vehicles, force.tolist(), wheel.tolist(), strict=True):
+            vehicle.act({"acceleration": one, "steering": other})
+
+    def step(self, dt: float) -> None:
+        """Move everybody by `dt`; whoever has crashed is taken away and a new vehicle enters elsewhere."""
+        super().step(dt)
+        self.steps += 1
+        crashed = [k for k, vehicle in enumerate(self.vehicles) if vehicle.crashed or vehicle.impact is not None]
+        if crashed:
+            self.collisions += 1
+            self.collided += len(crashed)
+            for slot in crashed:
+                if slot not in self.commands:
+                    self._enter(slot)
+        self._follow()
+
+
+class TownAction(ActionType):
+    """The ego's command: position in ACCELERATIONS, and a steering label in the autopilot's unit."""
+
+    def space(self) -> spaces.Space[Any]:
+        """Class of acceleration, and steering (positive to the left; 0.25 is the paper's crop)."""
+        return spaces.Tuple((spaces.Discrete(len(ACCELERATIONS)), spaces.Box(-0.4, 0.4, (1,), np.float32)))
+
+    @property
+    def vehicle_class(self) -> type[TownVehicle]:
+        """The class of the ego."""
+        return TownVehicle
+
+    def act(self, action: tuple[int, np.ndarray[Any, Any]]) -> None:
+        """Hand the command to the road, which applies all commands together."""
+        level, steering = action
+        self.env.road.commands[EGO] = (ACCELERATIONS[int(level)], float(np.asarray(steering).reshape(-1)[0]))
+
+
+class TownObservation(ObservationType):
+    """What the ego's autopilot knows, as a vector."""
+
+    def space(self) -> spaces.Space[Any]:
+        """Speed, limit, lateral and heading error, curvatures ahead, light (distance, is green), free way ahead."""
+        return spaces.Box(-np.inf, np.inf, (8 + len(CURVATURES),), np.float32)
+
+    def observe(self) -> np.ndarray[Any, Any]:
+        """The vector after the last step."""
+        road: Traffic = self.env.road
+        fleet, vehicle = road.fleet, road.vehicles[EGO]
+        move = int(fleet.move[EGO])
+        distance, green = LOOK, 1.0
+        if move >= 0 and fleet.s[EGO] <= fleet.move_start[EGO]:
+            distance = min(float(fleet.move_start[EGO] - fleet.s[EGO]), LOOK)
+            green = float(road.lights.states(road.time)[fleet.move_signal[move]] == GREEN)
+        way = [float(fleet.ahead(fleet.curvature, np.full(len(fleet.s), s))[EGO]) for s in CURVATURES]
+        course = float(fleet.ahead(fleet.heading, np.zeros(len(fleet.s)))[EGO])
+        error = (course - vehicle.heading + np.pi) % (2 * np.pi) - np.pi
+        gap = min(float(road.decisions.lead_gap[EGO]), LOOK) if road.steps else LOOK
+        limit = float(fleet.limits[fleet.strip[EGO]])
+        values = [vehicle.speed, limit, fleet.lateral[EGO], error, *way, distance, green, gap, float(road.steps) * DT]
+        return np.array(values, np.float32)
+
+
+class TownEnv(AbstractEnv):
+    """A town with its traffic at 10 Hz; the ego is one of the vehicles, and the autopilot drives the others.
+
+    An action is (class of acceleration, steering); `None` leaves the ego to the autopilot. The episode ends when the
+    ego collides or leaves its planned way. Config: `town` (TownSettings or a dict), `seed` (of a `reset` that names
+    none; None draws one), `duration` [s], `fast_lookups` (False: highway-env's own searches over everything). Raises
+    BadInputError for settings that cannot be met.
+    """
+
+    @classmethod
+    def default_config(cls) -> dict[str, Any]:
+        """highway-env's settings and ours."""
+        config: dict[str, Any] = super().default_config()
+        return config | {
+            "town": TownSettings(),
+            "seed": None,
+            "duration": 60.0,
+            "fast_lookups": True,
+            "simulation_frequency": round(1 / DT),
+            "policy_frequency": round(1 / DT),
+            "screen_width": 800,
+            "screen_height": 800,
+            "centering_position": [0.5, 0.5],
+        }
+
+    def define_spaces(self) -> None:
+        """Our own action and observation."""
+        self.action_type = TownAction(self)
+        self.observation_type = TownObservation(self)
+        self.action_space = self.action_type.space()
+        self.observation_space = self.observation_type.space()
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Draw a town and its traffic from `seed`; the same seed gives the same drive."""
+        self.drive_seed = self.config["seed"] if seed is None else seed
+        observation, info = super().reset(seed=seed, options=options)
+        return observation, info
+
+    def _reset(self) -> None:
+        settings = self.config["town"]
+        if isinstance(settings, dict):
+            settings = TownSettings.model_validate(settings)
+        seed = int(self.np_random.integers(2**31)) if self.drive_seed is None else self.drive_seed
+        self.road = make_traffic(settings, seed, fast=self.config["fast_lookups"])
+        self.controlled_vehicles = [self.road.vehicles[EGO]]
+
+    def _simulate(self, action: Any = None) -> None:
+        self.road.commands.clear()
+        super()._simulate(action)
+        self.controlled_vehicles = [self.road.vehicles[EGO]]
+
+    def _reward(self, action: Any) -> SupportsFloat:
+        """Speed as a share of the limit; -1 for a collision."""
+        del action
+        if self.vehicle.crashed:
+            return -1.0
+        fleet = self.road.fleet
+        return float(self.vehicle.speed / fleet.limits[fleet.strip[EGO]])
+
+    def _is_terminated(self) -> bool:
+        return bool(self.vehicle.crashed or abs(self.road.fleet.lateral[EGO]) > OFF_ROUTE)
+
+    def _is_truncated(self) -> bool:
+        return bool(self.time >= self.config["duration"])
+
+
+def make_traffic(settings: TownSettings, seed: int, *, fast: bool = True) -> Traffic:
+    """A town, its lights and its vehicles, all drawn from the seed.
+
+    Raises BadInputError when the settings cannot be met.
+    """
+    map_rng, light_rng, traffic_rng = (np.random.default_rng((seed, purpose)) for purpose in range(3))
+    town = draw_town(settings, map_rng)
+    room = sum(town.strips[entry].piece.length for entry in town.ways)
+    if settings.vehicles * 2 * APART > room:
+        raise BadInputError(
+            f"town: {settings.vehicles} vehicles do not fit on {room:.0f} m of lanes with {2 * APART:g} m for each; "
+            f"take at most {int(room / APART / 2)} (vehicles) or a larger grid"
+        )
+    return Traffic(town, settings, traffic_rng, fast=fast, lights=plan_lights(town, settings, light_rng))
+
+
+if "study/Town-v0" not in gym.registry:
+    gym.register("study/Town-v0", entry_point="study.sim.env:TownEnv")

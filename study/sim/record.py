@@ -1,0 +1,216 @@
+"""Recording: drives of TownEnv as Episodes, one for each seed, on as many processes as there are."""
+
+from __future__ import annotations
+
+import math
+import multiprocessing
+import shutil
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from study.config import BadInputError, RecordingSettings, TownSettings
+from study.episode import Agent, Episode, Lane, Light, empty_states, write_episode
+from study.sim.autopilot import DT, LENGTH, STEERING_UNIT, WIDTH
+from study.sim.env import TownEnv, Traffic
+from study.sim.town import LANE_WIDTH, Floats, Town
+
+FORMAT_VERSION = 1  # raised on purpose when the same settings and seed give another drive
+BEYOND = 60.0  # of the planned route that is recorded behind the last position [m]
+STANDING = 0.1  # [m/s]
+
+
+def record_episode(town: TownSettings, recording: RecordingSettings, seed: int) -> Episode:
+    """Drive the town of that seed on autopilot and record it at 10 Hz; the same arguments give the same bits.
+
+    Raises BadInputError when the settings cannot be met.
+    """
+    steps = round(recording.duration / DT)
+    if steps < 1:
+        raise BadInputError(f"recording: a duration of {recording.duration:g} s is shorter than one step of {DT:g} s")
+    env = TownEnv({"town": town, "seed": seed, "duration": math.inf})
+    recorder = Recorder(env.road)
+    for _ in range(round(recording.warm_up / DT)):
+        env.step(None)
+        recorder.watch()
+    for _ in range(steps):
+        recorder.before()
+        env.step(None)
+        recorder.after()
+    cycle = 2 * (town.green + town.yellow + town.all_red)
+    source = {
+        "writer": "study.sim",
+        "format_version": FORMAT_VERSION,
+        "town": town.model_dump(mode="json"),
+        "recording": {"warm_up": recording.warm_up, "duration": recording.duration},
+        "seed": seed,
+        "steering_unit": STEERING_UNIT,
+        "traffic": recorder.facts(cycle),
+    }
+    return recorder.episode(f"{seed:08d}", source)
+
+
+class Recorder:
+    """Watches a road from outside, step by step, and makes an Episode of what it saw."""
+
+    def __init__(self, road: Traffic) -> None:
+        self.road = road
+        self.standing = np.zeros(len(road.vehicles))  # since when [s]
+        self.rows: list[dict[str, Any]] = []
+        self.plans: dict[int, tuple[list[int], list[float]]] = {}
+        self.start = (road.collisions, road.collided)
+
+    def watch(self) -> None:
+        """Take note of a step that is not recorded."""
+        _, _, _, speed = self.road.pose()
+        self.standing = np.where(speed < STANDING, self.standing + DT, 0)
+        self.start = (self.road.collisions, self.road.collided)
+
+    def before(self) -> None:
+        """Take the poses from which the next commands follow."""
+        x, y, heading, speed = self.road.pose()
+        self.standing = np.where(speed < STANDING, self.standing + DT, 0)
+        fleet = self.road.fleet
+        for slot, agent in enumerate(self.road.agents):
+            self.plans.setdefault(agent, (fleet.routes[slot], fleet.starts[slot]))
+        row = {"agent": np.array(self.road.agents), "x": x, "y": y, "heading": heading, "speed": speed}
+        self.rows.append(row | {"standing": self.standing})
+
+    def after(self) -> None:
+        """Take the commands and what they were based on."""
+        decisions, row = self.road.decisions, self.rows[-1]
+        for name in ("steering", "acceleration", "light", "light_distance", "route_s", "lead_gap"):
+            row[name] = getattr(decisions, name)
+        row["light_state"] = self.road.light_states
+
+    def facts(self, cycle: float) -> dict[str, Any]:
+        """How the traffic was: collisions, share of vehicle-time standing longer than `cycle` [s], mean speed [m/s]."""
+        standing = np.array([row["standing"] for row in self.rows])
+        speed = np.array([row["speed"] for row in self.rows])
+        return {
+            "collisions": self.road.collisions - self.start[0],
+            "collided_vehicles": self.road.collided - self.start[1],
+            "standing_longer_than_cycle": round(float((standing > cycle).mean()), 6),
+            "light_cycle": cycle,
+            "mean_speed": round(float(speed.mean()), 4),
+        }
+
+    def episode(self, name: str, source: dict[str, Any]) -> Episode:
+        """The Episode of all recorded steps; y is turned to the north here, and nowhere else."""
+        town, rows = self.road.town, self.rows
+        agents = sorted(self.plans)
+        arrays = empty_states(len(rows), len(agents))
+        where = (np.arange(len(rows))[:, None], np.searchsorted(agents, np.array([row["agent"] for row in rows])))
+        seen = {key: np.array([row[key] for row in rows]) for key in rows[0] if key != "agent"}
+        routes, shifts = self._routes(agents, where[1], seen["route_s"])
+        seen["route_s"] = seen["route_s"] - shifts[where[1]]
+        seen["y"], seen["heading"] = -seen["y"], np.mod(-seen["heading"] + np.pi, 2 * np.pi) - np.pi
+        seen["speed"] = np.maximum(seen["speed"], 0)  # a full stop leaves 1e-16 of either sign
+        seen["lead_gap"] = np.where(np.isfinite(seen["lead_gap"]), seen["lead_gap"], np.nan)
+        for key, values in arrays.items():
+            values[where] = True if key == "present" else seen[key]
+        return Episode(
+            id=name,
+            source=source,
+            rate_hz=1 / DT,
+            labels="recorded",
+            agents=tuple(Agent(agent, LENGTH, WIDTH) for agent in agents),
+            lanes=tuple(_lane(town, number) for number in range(len(town.strips))),
+            lights=tuple(
+                Light(number, signal.stop_line * [1, -1], signal.entry) for number, signal in enumerate(town.signals)
+            ),
+            light_state=seen["light_state"],
+            routes=routes,
+            **arrays,
+        )
+
+    def _routes(
+        self, agents: list[int], columns: np.ndarray[Any, Any], s: Floats
+    ) -> tuple[tuple[np.ndarray[Any, Any], ...], Floats]:
+        """Each agent's way while it was recorded and BEYOND, and where that starts along its route [m]."""
+        lines, shifts = [], np.zeros(len(agents))
+        for column, agent in enumerate(agents):
+            strips, starts = self.plans[agent]
+            own = s[columns == column]
+            first = int(np.searchsorted(starts, max(own.min(), 0.0), side="right")) - 1
+            last = int(np.searchsorted(starts, own.max() + BEYOND))
+            shifts[column] = starts[first]
+            line = _line(self.road.town, strips[first:last])
+            lines.append((line * [1, -1]).astype(np.float32))
+        return tuple(lines), shifts
+
+
+def _line(town: Town, strips: list[int]) -> Floats:
+    """Centre line of joined strips, [P, 2] m: ends of straights, and points within 1 m of each other on arcs."""
+    points: list[Floats] = []
+    for strip in strips:
+        piece = town.strips[strip].piece
+        count = 1 if piece.curvature == 0 else math.ceil(piece.length)
+        x, y, _ = piece.at(np.linspace(0, piece.length, count + 1))
+        points.append(np.stack([x, y], axis=1)[len(points) > 0 :])
+    return np.concatenate(points)
+
+
+def _lane(town: Town, number: int) -> Lane:
+    strip = town.strips[number]
+    centre = _line(town, [number]) * [1, -1]
+    return Lane(number, centre, LANE_WIDTH, strip.left, strip.right, strip.junction, strip.limit)
+
+
+# --- many drives ----------------------------------------------------------------------------------------------------
+
+
+def record_all(
+    town: TownSettings,
+    recording: RecordingSettings,
+    seeds: Sequence[int],
+    folder: Path,
+    processes: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[Path]:
+    """Record the drives of `seeds` that `folder` lacks, as `folder/<seed:08d>`; returns all paths in order of `seeds`.
+
+    Whole drives only are ever seen there, so that a killed call can simply be repeated. The result does not depend on
+    `processes`. `progress` gets (drives done, drives in all). Raises BadInputError for settings that cannot be met.
+    """
+    if processes < 1:
+        raise BadInputError(f"processes: got {processes}; at least 1 is needed")
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = [folder / f"{seed:08d}" for seed in seeds]
+    for left in folder.glob(".*"):  # drafts of a call that was killed
+        if left.is_dir():
+            shutil.rmtree(left, ignore_errors=True)
+    missing = [(seed, path) for seed, path in zip(seeds, paths, strict=True) if not path.exists()]
+    done = len(paths) - len(missing)
+
+    def report() -> None:
+        if progress is not None:
+            progress(done, len(paths))
+
+    report()
+    jobs = [(town, recording, seed, path) for seed, path in missing]
+    if processes == 1 or len(jobs) < 2:
+        for job in jobs:
+            _record(*job)
+            done += 1
+            report()
+        return paths
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(processes, len(jobs)), mp_context=context) as pool:
+        futures = [pool.submit(_record, *job) for job in jobs]
+        try:
+            for future in as_completed(futures):
+                future.result()
+                done += 1
+                report()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    return paths
+
+
+def _record(town: TownSettings, recording: RecordingSettings, seed: int, path: Path) -> None:
+    write_episode(record_episode(town, recording, seed), path)

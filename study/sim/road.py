@@ -1,0 +1,224 @@
+"""highway-env's network, road and vehicle with spatial look-ups; one flag, `fast`, goes back to the stock ones.
+
+Look-ups only find candidates: what decides is highway-env's own lane distance and its own polygons, so that a drive is
+the same with either. Kinematics are highway-env's.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from highway_env.road.lane import AbstractLane
+from highway_env.road.road import LaneIndex, Road, RoadNetwork
+from highway_env.vehicle.kinematics import Vehicle
+from numpy.typing import NDArray
+
+from study.sim.town import Floats, Town, highway_lane
+
+CELL = 4.0  # of the grid over the town [m]
+KNOWN = 9.0  # lanes this near to a cell's centre are listed with it [m]
+TIE = 1e-9  # scores nearer than this are settled by highway-env's own arithmetic
+
+Ints = NDArray[np.int64]
+
+
+class TownNetwork(RoadNetwork):
+    """highway-env's network of a town, with a grid that knows which lanes are near."""
+
+    def __init__(self, town: Town, *, fast: bool = True) -> None:
+        super().__init__()
+        self.fast = fast
+        for strip in town.strips:
+            start, end, _ = strip.index
+            self.add_lane(start, end, highway_lane(strip))
+        indices = [(a, b, k) for a, ends in self.graph.items() for b, lanes in ends.items() for k in range(len(lanes))]
+        self.indices: list[LaneIndex] = indices  # in the order in which highway-env searches
+        self.lanes: list[AbstractLane] = [self.get_lane(index) for index in indices]
+        strips = {strip.index: strip.piece for strip in town.strips}
+        pieces = [strips[index] for index in indices]
+        self.start = np.array([(piece.x, piece.y) for piece in pieces])
+        self.curvature = np.array([piece.curvature for piece in pieces])
+        self.heading = np.array([piece.heading for piece in pieces])
+        self.length = np.array([piece.length for piece in pieces])
+        self.direction = np.stack([np.cos(self.heading), np.sin(self.heading)], axis=1)
+        if fast:
+            self._build_grid()
+
+    def _build_grid(self) -> None:
+        """For every cell, the lanes within KNOWN of its centre, nearest first (padded with -1)."""
+        lines = []
+        for piece_start, curvature, heading, length in zip(
+            self.start, self.curvature, self.heading, self.length, strict=True
+        ):
+            s = np.linspace(0, length, math.ceil(length) + 1)
+            turned = heading + curvature * s
+            if curvature == 0:
+                line = piece_start + s[:, None] * np.array([math.cos(heading), math.sin(heading)])
+            else:
+                line = (
+                    piece_start
+                    + np.stack([np.sin(turned) - math.sin(heading), math.cos(heading) - np.cos(turned)], axis=1)
+                    / curvature
+                )
+            lines.append(line)
+        everything = np.concatenate(lines)
+        self.low = everything.min(axis=0) - KNOWN
+        self.cells = np.ceil((everything.max(axis=0) + KNOWN - self.low) / CELL).astype(np.int64)
+        columns: list[tuple[Ints, Ints, Floats]] = []
+        for number, line in enumerate(lines):
+            begin = ((line.min(axis=0) - KNOWN - self.low) / CELL).astype(np.int64).clip(0)
+            end = np.minimum(((line.max(axis=0) + KNOWN - self.low) / CELL).astype(np.int64) + 1, self.cells)
+            cx, cy = np.meshgrid(np.arange(begin[0], end[0]), np.arange(begin[1], end[1]), indexing="ij")
+            centres = np.stack([cx.reshape(-1), cy.reshape(-1)], axis=1) * CELL + CELL / 2 + self.low
+            squared = ((centres[:, None] - line[None]) ** 2).sum(-1).min(axis=1)
+            distance = np.sqrt(squared) - 0.51  # samples are at most 1 m apart: never more than the true distance
+            close = distance < KNOWN
+            cell = (cx.reshape(-1) * self.cells[1] + cy.reshape(-1))[close]
+            columns.append((cell, np.full(len(cell), number), distance[close]))
+        cell, lane, distance = (np.concatenate(parts) for parts in zip(*columns, strict=True))
+        order = np.lexsort((distance, cell))
+        cell, lane, distance = cell[order], lane[order], distance[order]
+        count = np.bincount(cell, minlength=int(self.cells.prod()))
+        rank = np.arange(len(cell)) - np.repeat(np.cumsum(count) - count, count)
+        self.near_lanes = np.full((len(count), int(count.max())), -1)
+        self.near_distance = np.full(self.near_lanes.shape, np.inf)
+        self.near_lanes[cell, rank], self.near_distance[cell, rank] = lane, distance
+
+    def get_closest_lane_index(self, position: NDArray[Any], heading: float | None = None) -> LaneIndex:
+        """highway-env's look-up; with `fast`, only among the lanes near the position."""
+        if not self.fast or heading is None:
+            index: LaneIndex = super().get_closest_lane_index(position, heading)
+            return index
+        return self.indices[int(self.closest_lanes(np.asarray(position)[None], np.array([heading]))[0])]
+
+    def closest_lanes(self, positions: Floats, headings: Floats) -> Ints:
+        """Positions in `indices` of the closest lanes of many poses, [N, 2] m and [N] rad."""
+        place = np.floor((positions - self.low) / CELL).astype(np.int64)
+        outside = ((place < 0) | (place >= self.cells)).any(axis=1)
+        cell = np.where(outside, 0, place[:, 0] * self.cells[1] + place[:, 1])
+        lanes, distances = self.near_lanes[cell], self.near_distance[cell]
+        few = min(3, lanes.shape[1])
+        rows = np.repeat(np.arange(len(positions)), few)
+        first = np.full((len(positions), few), np.inf)
+        some = lanes[:, :few]
+        first[some >= 0] = self._scores(positions, headings, rows[(some >= 0).reshape(-1)], some[some >= 0])
+        bound = first.min(axis=1)  # a lane's score is never below its distance, so farther lanes cannot win
+        slack = CELL / math.sqrt(2)
+        rows, ranks = np.nonzero((distances <= bound[:, None] + slack + TIE) & (lanes >= 0))
+        found = lanes[rows, ranks]
+        scores = self._scores(positions, headings, rows, found)
+        best = np.full(len(positions), np.inf)
+        np.minimum.at(best, rows, scores)
+        close = scores <= best[rows] + TIE
+        rows, found = rows[close], found[close]
+        winner = np.full(len(positions), len(self.indices))
+        np.minimum.at(winner, rows, found)
+        outside |= ~(bound + slack + TIE < KNOWN)
+        tied = np.bincount(rows, minlength=len(positions)) > 1
+        for row in np.flatnonzero(tied & ~outside):
+            options = np.sort(found[rows == row])
+            own = [self.lanes[k].distance_with_heading(positions[row], headings[row]) for k in options]
+            winner[row] = options[int(np.argmin(own))]
+        for row in np.flatnonzero(outside):
+            index = super().get_closest_lane_index(positions[row], headings[row])
+            winner[row] = self.indices.index(index)
+        return winner
+
+    def _scores(self, positions: Floats, headings: Floats, rows: Ints, lanes: Ints) -> Floats:
+        """highway-env's `distance_with_heading` of pairs of a pose (`rows`) and a lane, up to rounding."""
+        delta = positions[rows] - self.start[lanes]
+        c, s = self.direction[lanes, 0], self.direction[lanes, 1]
+        along, aside = delta[:, 0] * c + delta[:, 1] * s, delta[:, 1] * c - delta[:, 0] * s
+        curvature = self.curvature[lanes]
+        bent = np.flatnonzero(curvature)
+        if len(bent):
+            k = curvature[bent]
+            # from the centre of the arc, in the frame of its start
+            u, w = k * along[bent], 1 - k * aside[bent]
+            aside[bent] = (1 - np.hypot(u, w)) / k
+            along[bent] = np.arctan2(u, w) / k
+        over = np.maximum(along - self.length[lanes], 0) + np.maximum(-along, 0)
+        angle = headings[rows] - self.heading[lanes] - curvature * along
+        turned = np.abs(np.mod(angle + np.pi, 2 * np.pi) - np.pi)
+        scores: Floats = np.abs(aside) + over + turned
+        return scores
+
+
+class TownVehicle(Vehicle):
+    """A vehicle whose lane is looked up together with all the others'."""
+
+    def on_state_update(self) -> None:
+        """Leave the lane to the road, which looks up all of them at once."""
+        if not self.road.network.fast:
+            super().on_state_update()
+
+
+class TownRoad(Road):
+    """highway-env's road, whose searches over all pairs of vehicles are done with arrays."""
+
+    @property
+    def fast(self) -> bool:
+        """Whether the spatial look-ups are used."""
+        return bool(self.network.fast)
+
+    def pose(self) -> tuple[Floats, Floats, Floats, Floats]:
+        """x, y [m], heading [rad] and speed [m/s] of all vehicles."""
+        positions = np.array([vehicle.position for vehicle in self.vehicles])
+        heading = np.array([vehicle.heading for vehicle in self.vehicles], np.float64)
+        speed = np.array([vehicle.speed for vehicle in self.vehicles], np.float64)
+        return positions[:, 0].copy(), positions[:, 1].copy(), heading, speed
+
+    def pairs_within(self, distance: float) -> tuple[Ints, Ints]:
+        """All (i, j), i != j, sorted, of vehicles that are nearer to each other than `distance` [m]."""
+        if self.fast:
+            x, y, _, _ = self.pose()
+            dx, dy = x[:, None] - x[None], y[:, None] - y[None]
+            near = dx * dx + dy * dy < distance * distance
+            np.fill_diagonal(near, val=False)
+            i, j = np.nonzero(near)
+            return i, j
+        number = {id(vehicle): k for k, vehicle in enumerate(self.vehicles)}
+        pairs = [
+            (k, number[id(other)])
+            for k, vehicle in enumerate(self.vehicles)
+            for other in self.close_vehicles_to(vehicle, distance, sort=False)
+        ]
+        both = np.array(pairs, np.int64).reshape(-1, 2)
+        return both[:, 0], both[:, 1]
+
+    def step(self, dt: float) -> None:
+        """Move every vehicle by `dt` [s], find its lane and handle collisions."""
+        if not self.fast:
+            super().step(dt)
+            return
+        for vehicle in self.vehicles:
+            vehicle.step(dt)
+        pose = self.pose()
+        network = self.network
+        lanes = network.closest_lanes(np.stack(pose[:2], axis=1), pose[2])
+        for vehicle, lane in zip(self.vehicles, lanes, strict=True):
+            vehicle.lane_index, vehicle.lane = network.indices[lane], network.lanes[lane]
+        for i, j in zip(*self._touching(pose, dt), strict=True):
+            self.vehicles[i].handle_collisions(self.vehicles[j], dt)
+
+    def _touching(self, pose: tuple[Floats, Floats, Floats, Floats], dt: float) -> tuple[Ints, Ints]:
+        """Pairs i < j that may touch within `dt`: no axis of the two boxes, moved as they will be, separates them."""
+        x, y, heading, speed = pose
+        reach = TownVehicle.LENGTH + TownVehicle.WIDTH + np.abs(speed) * dt  # more than highway-env's two diagonals
+        i, j = np.nonzero(np.triu((x[:, None] - x[None]) ** 2 + (y[:, None] - y[None]) ** 2 < reach[:, None] ** 2, 1))
+        c, s = np.cos(heading), np.sin(heading)
+        half_length, half_width = TownVehicle.LENGTH / 2, TownVehicle.WIDTH / 2
+        apart = np.zeros(len(i), bool)
+        dx, dy = x[j] - x[i], y[j] - y[i]
+        vx, vy = (speed[i] * c[i] - speed[j] * c[j]) * dt, (speed[i] * s[i] - speed[j] * s[j]) * dt
+        parallel, across = np.abs(c[i] * c[j] + s[i] * s[j]), np.abs(c[i] * s[j] - s[i] * c[j])
+        for k in (i, j):
+            for ax, ay, own, other in (
+                (c[k], s[k], half_length, parallel * half_length + across * half_width),
+                (-s[k], c[k], half_width, parallel * half_width + across * half_length),
+            ):
+                between = np.abs(dx * ax + dy * ay) - own - other
+                apart |= between > np.abs(vx * ax + vy * ay) + 1e-6
+        return i[~apart], j[~apart]
