@@ -101,12 +101,12 @@ class _Window:
     column: float
     row: float
 
-    def affine(self, x: float, y: float, heading: float) -> Floats:
-        """World [m] -> pixel centres [2, 3], heading up; left of the ego is left in the picture."""
-        forward, left = (np.cos(heading), np.sin(heading)), (-np.sin(heading), np.cos(heading))
-        turn = -self.scale * np.array([left, forward])
-        at = np.array([self.column, self.row]) - 0.5 - turn @ (x, y)
-        return np.column_stack([turn, at])
+    def affines(self, x: Floats, y: Floats, heading: Floats) -> Floats:
+        """World [m] -> pixel centres [M, 2, 3] for egos [M], heading up; left of the ego is left in the picture."""
+        east, north = self.scale * np.cos(heading), self.scale * np.sin(heading)
+        column = np.stack([north, -east, self.column - 0.5 - north * x + east * y], axis=1)
+        row = np.stack([-east, -north, self.row - 0.5 + east * x + north * y], axis=1)
+        return np.stack([column, row], axis=1)
 
 
 class Renderer:
@@ -165,84 +165,79 @@ class Renderer:
                 )
 
     def _render(self, moments: Moments, images: Image, masks: Image) -> None:
-        size, palette = self.settings.render, self._palette
-        boxes, colours, ends = self._boxes(moments)
-        states = governing_light(self.episode, self.settings, moments)
+        episode, size = self.episode, self.settings.render
+        now = (moments[:, 0], moments[:, 1])
+        x, y, heading = (values[now].astype(np.float64) for values in (episode.x, episode.y, episode.heading))
+        affines = self._window.affines(x, y, heading)
+        cuts = self._map.cuts(affines)
+        boxes, colours, ends = self._boxes(moments, affines, heading)
+        states = governing_light(episode, self.settings, moments).tolist()
         canvas, flat = np.empty((size, size), np.uint8), np.empty((size, size), np.uint8)
-        grey = np.empty((len(moments), 2, IMAGE, IMAGE), np.uint8)
+        grey = np.zeros((len(moments), 2, IMAGE, IMAGE), np.uint8)
         start = 0
-        for index, (step, ego) in enumerate(moments):
-            where = (self.episode.x[step, ego], self.episode.y[step, ego], self.episode.heading[step, ego])
-            affine = self._window.affine(*map(float, where))
-            self._map.paint(canvas, affine)
-            self._paint_route(canvas, affine, int(ego), float(self.episode.route_s[step, ego]), int(states[index]))
-            seen, pred, plan = ends[index]
+        for index, (seen, pred, plan) in enumerate(ends):
+            self._map.paint(canvas, affines[index], cuts[index])
+            self._paint_route(canvas, affines[index], moments[index], states[index])
             for box, colour in zip(boxes[start:seen], colours[start:seen], strict=True):
                 cv2.fillConvexPoly(canvas, box, colour, cv2.LINE_8, _SHIFT)
-            channels = [_shrink(cv2.LUT(canvas, palette[:, channel], dst=flat)) for channel in range(3)]
+            channels = [_shrink(cv2.LUT(canvas, channel, dst=flat)) for channel in self._palette]
             cv2.merge(channels, dst=images[index])
             for mask, covering in enumerate((boxes[seen:pred], boxes[pred:plan])):
-                flat.fill(0)
-                for box in covering:
-                    cv2.fillConvexPoly(flat, box, _MASK, cv2.LINE_8, _SHIFT)
-                grey[index, mask] = _shrink(flat)
+                if covering:
+                    flat.fill(0)
+                    for box in covering:
+                        cv2.fillConvexPoly(flat, box, _MASK, cv2.LINE_8, _SHIFT)
+                    grey[index, mask] = _shrink(flat)
             start = plan
         masks[:] = np.packbits((grey >= _MASK // 2).reshape(len(moments), 2, -1), axis=2)
 
-    def _boxes(self, moments: Moments) -> tuple[list[NDArray[np.int32]], list[int], list[list[int]]]:
+    def _boxes(
+        self, moments: Moments, affines: Floats, heading: Floats
+    ) -> tuple[list[NDArray[np.int32]], list[int], list[list[int]]]:
         """Boxes in paint order, frame by frame, with palette indices; for each frame the ends of its three parts.
 
         The parts are past and present poses, the others' next poses, the ego's next poses.
         """
-        episode, history, window = self.episode, self.settings.history, self._window
+        episode, history, size = self.episode, self.settings.history, self.settings.render
+        scale = self._window.scale
         offsets = np.arange(-history, self.settings.future + 1)
-        steps, egos = moments[:, :1] + offsets, moments[:, 1]
+        steps = moments[:, :1] + offsets
         inside = (steps >= 0) & (steps < episode.steps)
         steps = steps.clip(0, episode.steps - 1)
-        now = (moments[:, 0], egos)
-        # Cull in float32 relative to the centre of the view: cheap, and a metre of margin covers its rounding.
-        heading = episode.heading[now].astype(np.float64)
-        forward = np.stack([np.cos(heading), np.sin(heading)], axis=1)
-        place = np.stack([episode.x[now], episode.y[now]], axis=1).astype(np.float64)
-        ahead = self.settings.view / 2 - self.settings.behind
-        middle = (place + ahead * forward).astype(np.float32)
+        # Cull around the centre of the view in float32: cheap, and a metre of margin covers its rounding.
+        centre = np.array([size / 2, size / 2]) - affines[:, :, 2]
+        middle = (np.einsum("mij,mi->mj", affines[:, :, :2], centre) / scale**2).astype(np.float32)
         east = episode.x[steps] - middle[:, 0, None, None]
         north = episode.y[steps] - middle[:, 1, None, None]
-        reach = np.float32(np.hypot(*self._sizes.T).max(initial=0) / 2 + 1)
-        near = (
-            east * east + north * north < (np.float32(self.settings.view) * np.float32(0.5**0.5) + reach) ** 2
-        )  # NaN is never near
+        reach = np.hypot(*self._sizes.T).max(initial=0) / 2 + 1
+        near = east * east + north * north < np.float32(self.settings.view / 2**0.5 + reach) ** 2  # NaN is never near
         near &= episode.present[steps] & inside[..., None]
         frame, pose, agent = np.nonzero(near)
         step = steps[frame, pose]
 
-        east = episode.x[step, agent] - place[frame, 0]
-        north = episode.y[step, agent] - place[frame, 1]
-        fx, fy = forward[frame].T
-        column = window.column - window.scale * (fx * north - fy * east)
-        row = window.row - window.scale * (fx * east + fy * north)
-        margin, size = reach * window.scale, self.settings.render
+        at = np.stack([episode.x[step, agent], episode.y[step, agent], np.ones(len(step))], axis=1)
+        column, row = np.einsum("kij,kj->ik", affines[frame], at)
+        margin = reach * scale
         seen = (column > -margin) & (column < size + margin) & (row > -margin) & (row < size + margin)
         frame, pose, agent, step, column, row = (v[seen] for v in (frame, pose, agent, step, column, row))
 
         turn = episode.heading[step, agent] - heading[frame]
         # cv2 fills a pixel whose centre lies up to half a pixel outside: boxes are made that much smaller.
-        half = self._sizes[agent] * (window.scale / 2) - 0.5
+        half = self._sizes[agent] * (scale / 2) - 0.5
         along = np.stack([-np.sin(turn), -np.cos(turn)], axis=1) * half[:, :1]
         across = np.stack([-np.cos(turn), np.sin(turn)], axis=1) * half[:, 1:]
-        centre = np.stack([column, row], axis=1) - 0.5
-        corners = np.stack([centre + along + across, centre + along - across, centre - along - across], axis=1)
-        corners = np.concatenate([corners, (centre - along + across)[:, None]], axis=1)
+        front, back = along + across, along - across
+        middles = np.stack([column, row], axis=1)[:, None]
+        corners = middles + np.stack([front, back, -front, -back], axis=1)
         fixed = np.rint(corners * (1 << _SHIFT)).astype(np.int32)
 
         # A pose that stands where the next younger one stands is painted over by it: leave it out.
-        at = np.full((len(moments), len(offsets) + 1, near.shape[2]), -1)
-        at[frame, pose, agent] = np.arange(len(frame))
-        younger = at[frame, pose + 1, agent]
-        hidden = (younger >= 0) & (fixed == fixed[younger]).all(axis=(1, 2)) & (pose != history)
-        past = pose <= history
-        own = agent == egos[frame]
-        layer = np.where(past, own * 1, own * 1 + 2)  # others' past, ego's past, pred, plan
+        number = np.full((len(moments), len(offsets) + 1, near.shape[2]), -1)
+        number[frame, pose, agent] = np.arange(len(frame))
+        younger = number[frame, pose + 1, agent]
+        hidden = (younger >= 0) & (pose != history) & (fixed == fixed[younger]).all(axis=(1, 2))
+        own = agent == moments[frame, 1]
+        layer = np.where(pose <= history, 0, 2) + own  # others' past, ego's past, pred, plan
         order = np.lexsort((pose, layer, frame))
         order = order[~hidden[order]]
         colour = _OTHERS + pose + own * (history + 1)
@@ -250,8 +245,8 @@ class Renderer:
         ends = np.searchsorted(part, np.arange(len(moments) * 3), side="right").reshape(-1, 3)
         return list(fixed[order]), colour[order].tolist(), ends.tolist()
 
-    def _paint_route(self, canvas: Image, affine: Floats, ego: int, progress: float, light: int) -> None:
-        route = self._routes[ego]
+    def _paint_route(self, canvas: Image, affine: Floats, moment: Moments, light: int) -> None:
+        route, progress = self._routes[moment[1]], self.episode.route_s[moment[0], moment[1]]
         if route is None or not np.isfinite(progress):
             return
         length, x, y = route
@@ -264,7 +259,7 @@ class Renderer:
 
 
 def _palette(history: int) -> Image:
-    """Colours [256, 3] RGB by palette index. Past poses fade to black, linear in their age."""
+    """Colours [3, 256] RGB by palette index. Past poses fade to black, linear in their age."""
     if _OTHERS + 2 * (history + 1) > 256:
         raise BadInputError(f"birdview.history: at most {(256 - _OTHERS) // 2 - 1} past poses, got {history}")
     colours = np.zeros((256, 3), np.uint8)
@@ -275,7 +270,7 @@ def _palette(history: int) -> Image:
     light = np.rint(255 * np.arange(1, history + 2) / (history + 1))
     colours[_OTHERS : _OTHERS + history + 1, :2] = light[:, None]
     colours[_OTHERS + history + 1 : _OTHERS + 2 * (history + 1), 2] = light
-    return colours
+    return np.ascontiguousarray(colours.T)
 
 
 def _shrink(picture: Image) -> Image:
@@ -317,6 +312,7 @@ class _Map:
         self._charts = [_chart(lane, plain=len(limits) < 2) for lane in lanes]
         self._scale, self._reach = scale, window * 2**0.5 / scale
         self._picture: Image | None = None
+        self._origin = np.zeros(2)
         if not lanes:
             return
         self._origin = np.min([chart.low for chart in self._charts], axis=0) - 1
@@ -327,13 +323,17 @@ class _Map:
             affine = np.column_stack([np.eye(2) * scale, -self._origin * scale - 0.5])
             _paint(self._picture, self._charts, affine, scale)
 
-    def paint(self, canvas: Image, affine: Floats) -> None:
-        """Overwrite the canvas with the map as it lies under `affine`, world [m] -> pixels."""
+    def cuts(self, affines: Floats) -> Floats:
+        """Pixels of the window -> pixels of the large picture [M, 2, 3], for world [m] -> pixels of the window."""
+        back = affines[:, :, :2].transpose(0, 2, 1) / self._scale  # a turn times scale: its inverse, times scale
+        shift = -back @ affines[:, :, 2:] - (self._origin * self._scale + 0.5)[:, None]
+        return np.concatenate([back, shift], axis=2)
+
+    def paint(self, canvas: Image, affine: Floats, cut: Floats) -> None:
+        """Overwrite the canvas with the map as it lies under `affine`, world [m] -> pixels; `cut` is its `cuts`."""
         if self._picture is not None:
-            back = affine[:, :2].T / self._scale  # a turn times scale: its inverse, times scale
-            shift = -back @ affine[:, 2] - self._origin * self._scale - 0.5
             flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
-            cv2.warpAffine(self._picture, np.column_stack([back, shift]), canvas.shape, dst=canvas, flags=flags)
+            cv2.warpAffine(self._picture, cut, canvas.shape, dst=canvas, flags=flags)
             return
         canvas.fill(0)
         centre = np.linalg.solve(affine[:, :2], np.array(canvas.shape) / 2 - affine[:, 2])
