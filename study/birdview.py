@@ -41,7 +41,7 @@ CHUNK = 64  # moments whose geometry is computed together
 _PLAIN, _BOUNDARY, _LINE = 1 + LIMIT_SHADES, 2 + LIMIT_SHADES, 3 + LIMIT_SHADES  # palette; 0 is beside the road
 _GREEN, _RED, _OTHERS = 4 + LIMIT_SHADES, 5 + LIMIT_SHADES, 6 + LIMIT_SHADES  # others' oldest pose, then younger ones
 _MASK = 240  # of a set pixel: averages of sixteen such are whole numbers
-_SHIFT = 4  # fractional bits of the coordinates given to cv2
+_SHIFT = 8  # fractional bits of the coordinates given to cv2
 
 Image = NDArray[np.uint8]
 Moments = NDArray[np.int64]
@@ -275,7 +275,7 @@ def _palette(history: int) -> Image:
 
 def _shrink(picture: Image) -> Image:
     """The area average [64, 64] of a square picture. Halving twice is four times faster than one step by four."""
-    while picture.shape[0] % 2 == 0 and picture.shape[0] >= 2 * IMAGE:
+    while picture.shape[0] % (2 * IMAGE) == 0:
         side = picture.shape[0] // 2
         picture = cv2.resize(picture, (side, side), interpolation=cv2.INTER_AREA)
     if picture.shape[0] != IMAGE:

@@ -104,7 +104,9 @@ class BirdviewSettings(Settings):
 
     view: Positive = Field(40.0, description="side of the square field of view [m] (Sec. III-A)")
     behind: NotNegative = Field(15.0, description="of which lies behind the ego [m] (Sec. III-A: ego at 20 m, 15 m)")
-    render: Count = Field(256, description="pixels a side before the area average to 64 (Sec. IV-A)")
+    render: Annotated[int, Field(ge=IMAGE)] = Field(
+        256, description="pixels a side before the area average to 64 (Sec. IV-A)"
+    )
     history: Annotated[int, Field(ge=0)] = Field(10, description="past poses at 10 Hz (Sec. III-A)")
     future: Annotated[int, Field(ge=1)] = Field(10, description="next poses at 10 Hz in the pred and plan masks")
     light_range: Positive = Field(27.0, description="a light colours the route when its stop line is this near [m]")
