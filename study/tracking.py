@@ -23,7 +23,7 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -147,10 +147,12 @@ class Tracker:
         if not uri.startswith(SCHEMES) or uri == SQLITE:
             raise BadInputError(f"tracking URI '{self.uri}' cannot be used; give {DEFAULT_URI} or http://host:port")
         folder = None
+        self._lock: Path | None = None
         if uri.startswith(SQLITE):
             path = Path(uri.removeprefix(SQLITE).partition("?")[0]).absolute()
             folder = path.parent / "artifacts"
-            _prepare_file(path, folder, self.uri)
+            self._lock = path.with_name(f".{path.name}.lock")
+            _prepare_file(path, folder, self._lock, self.uri)
             uri = f"{SQLITE}{path}"
         elif uri.startswith("http"):
             _probe(uri, self.uri)
@@ -238,7 +240,7 @@ class Tracker:
         key = content_key("sweep run", plan, (), PLAN_VERSION)
         name = f"{grid.name} ({profile})"
         facts = {name: value for name, value in provenance.items() if name != "diff"}
-        with self._guard():
+        with self._guard(), _alone(self._lock):
             sweeps = self._search("tags.kind = 'sweep'")
             latest = max((_opened(run) for run in sweeps), default=0)
             tags = {
@@ -247,26 +249,25 @@ class Tracker:
                 "reused": self._reused(planned, name),
                 **({COMMIT: str(provenance["commit"])} if provenance.get("commit") else {}),
             }
+            params = _params({**_flat(plan["grid"]), "profile": profile, **_flat(plan["settings"])})
             mine = [run for run in sweeps if run.data.tags.get("plan_key") == key]
             if mine:
                 run_id = str(mine[0].info.run_id)
                 self.client.update_run(run_id, status="RUNNING")
             else:
                 identity = {"kind": "sweep", "sweep": grid.name, "profile": profile, "plan_key": key, NOTE: grid.title}
-                run_id = self._create(name, identity)
-                first = self._search(f"tags.plan_key = '{key}'")[0].info.run_id
-                if first != run_id:  # two parents started at once: both take the same one
-                    self.client.delete_run(run_id)
-                    run_id = str(first)
-                params = {**_flat(plan["grid"]), "profile": profile, **_flat(plan["settings"])}
-                self.client.log_batch(run_id, params=_params(params))
+                created = self._create(name, identity)
+                run_id = str(self._search(f"tags.plan_key = '{key}'")[0].info.run_id)
+                if created != run_id:  # a server has no lock: of two parents started at once, both take the first
+                    self.client.delete_run(created)
+            _insert(self.client.log_batch, run_id, params=params)
             self.client.log_batch(run_id, tags=[RunTag(name, _short(value)) for name, value in tags.items() if value])
             self.client.log_dict(run_id, plan, "plan.json")
             self.client.log_dict(run_id, dict(data), "data.json")
             self.client.log_dict(run_id, facts, "provenance.json")
             self.client.log_text(run_id, str(provenance.get("diff") or ""), "uncommitted.diff")
             if data:
-                self.client.log_inputs(run_id, datasets=[_dataset(data)])
+                _insert(self.client.log_inputs, run_id, datasets=[_dataset(data)])
         return run_id
 
     def _reused(self, planned: Mapping[str, Cell], name: str) -> str:
@@ -438,9 +439,12 @@ class Tracker:
         with self._guard(), tempfile.TemporaryDirectory() as name:
             key = self.client.get_run(run_id).data.tags.get("cell_key")
             folder = Path(name)
+            there = {Path(file.path).name for file in self.client.list_artifacts(run_id, RESULT)}
             try:
                 # Only names that we know are asked for, so no name from the store can point out of the folder.
                 for file in RESULT_FILES:
+                    if file not in there:
+                        raise FileNotFoundError(f"{file} is missing")  # noqa: TRY301 - one report for all damage
                     Path(self.client.download_artifacts(run_id, f"{RESULT}/{file}", name)).replace(folder / file)
                 result = CellResult.load(folder)
                 wrong = f"it is the result of cell {result.key}" if result.key != key else ""
@@ -589,6 +593,16 @@ def _opened(run: Run) -> int:
     return int(run.data.tags.get("opened", 0))
 
 
+def _insert(write: Callable[..., Any], *what: Any, **more: Any) -> None:
+    """Write; when another process has written the same in this moment, MLflow's insert fails once, then finds it."""
+    try:
+        write(*what, **more)
+    except MlflowException as error:
+        if error.error_code != "BAD_REQUEST":
+            raise
+        write(*what, **more)
+
+
 # --- stores ---------------------------------------------------------------------------------------------------------
 
 
@@ -604,6 +618,17 @@ def _few_tries() -> Iterator[None]:
         for name, value in before.items():
             if value is not None:
                 os.environ[name] = value
+
+
+@contextmanager
+def _alone(lock: Path | None) -> Iterator[None]:
+    """Hold a file's lock; a process that dies lets go of it. Without a file there is nothing to hold."""
+    if lock is None:
+        yield
+        return
+    with lock.open("w") as stream:
+        fcntl.flock(stream, fcntl.LOCK_EX)
+        yield
 
 
 def _probe(uri: str, shown: str) -> None:
@@ -622,14 +647,13 @@ def _probe(uri: str, shown: str) -> None:
         ) from None
 
 
-def _prepare_file(path: Path, artifacts: Path, shown: str) -> None:
+def _prepare_file(path: Path, artifacts: Path, lock: Path, shown: str) -> None:
     """Make the database whole or not at all; refuse a file that is not MLflow's."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         if not path.exists():
             # MLflow needs seconds for its tables; a process killed in between would leave a database half made.
-            with path.with_name(f".{path.name}.lock").open("w") as lock:
-                fcntl.flock(lock, fcntl.LOCK_EX)
+            with _alone(lock):
                 if not path.exists():
                     draft = path.with_name(f".{path.name}.draft")
                     draft.unlink(missing_ok=True)

@@ -1,0 +1,71 @@
+"""Provenance of a result."""
+
+import getpass
+import json
+import platform
+import subprocess
+
+import pytest
+
+from study.provenance import DIFF_LIMIT, provenance
+
+
+def git(folder, *words):
+    identity = ["-c", "user.name=t", "-c", "user.email=t@example.org"]
+    return subprocess.run(["git", "-C", str(folder), *identity, *words], check=True, capture_output=True, text=True)
+
+
+@pytest.fixture
+def checkout(tmp_path):
+    (tmp_path / "study").mkdir()
+    (tmp_path / "study" / "a.py").write_text("A = 1\n")
+    (tmp_path / "requirements.lock").write_text("numpy==2.2\n")
+    git(tmp_path, "init", "-q")
+    git(tmp_path, "add", ".")
+    git(tmp_path, "commit", "-qm", "first")
+    return tmp_path
+
+
+def test_a_clean_checkout_is_its_commit(checkout):
+    found = provenance(checkout)
+    assert found["commit"] == git(checkout, "rev-parse", "HEAD").stdout.strip()
+    assert (found["dirty"], found["diff"]) == (False, "")
+    assert len(found["lock"]) == 64
+
+
+def test_changes_and_new_source_files_are_in_the_diff_and_the_index_stays(checkout):
+    (checkout / "study" / "a.py").write_text("A = 2\n")
+    (checkout / "study" / "b.py").write_text("B = 3\n")
+    before = git(checkout, "status", "--porcelain").stdout
+    found = provenance(checkout)
+    assert found["dirty"]
+    assert "+A = 2" in found["diff"]
+    assert "+B = 3" in found["diff"]
+    assert git(checkout, "status", "--porcelain").stdout == before
+
+
+def test_new_files_elsewhere_stay_private(checkout):
+    """A file of passwords beside the code is nobody's business."""
+    (checkout / ".env").write_text("PASSWORD=hunter2\n")
+    assert "hunter2" not in provenance(checkout)["diff"]
+
+
+def test_a_huge_diff_is_cut_and_says_so(checkout):
+    (checkout / "study" / "a.py").write_text("x\n" * DIFF_LIMIT)
+    diff = provenance(checkout)["diff"]
+    assert len(diff) < DIFF_LIMIT + 100
+    assert diff.rstrip().endswith("bytes in all]")
+
+
+def test_outside_a_checkout_the_rest_is_known(tmp_path):
+    found = provenance(tmp_path)
+    assert (found["commit"], found["lock"], found["diff"]) == (None, None, "")
+    assert found["packages"]["numpy"]
+    assert found["cores"] >= 1
+
+
+def test_no_user_or_host_name_is_told(checkout):
+    text = json.dumps({name: value for name, value in provenance(checkout).items() if name != "packages"})
+    assert platform.node() not in text
+    assert getpass.getuser() not in text
+    assert str(checkout) not in text
