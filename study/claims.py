@@ -24,6 +24,7 @@ from study.stats import ACCURACY, STEERING, Estimate, Panel, Point
 
 State = Literal["holds", "fails", "open"]
 Outcome = Literal["reproduced", "not reproduced", "inconclusive", "not tested"]
+OUTCOMES: tuple[Outcome, ...] = ("reproduced", "not reproduced", "inconclusive", "not tested")
 Unit = Literal["points", "loss", "epochs", "ratio"]
 
 MINUS = "\N{MINUS SIGN}"

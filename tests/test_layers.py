@@ -11,7 +11,8 @@ LAYERS = [
     {"frames"},
     {"autoencoder", "policy", "stats"},
     {"cell", "claims"},
-    {"tracking", "grid", "figures", "display"},
+    {"tracking", "grid", "figures", "display", "summary"},
+    {"drawings"},
     {"data", "report", "worker"},
     {"sweep"},
 ]

@@ -1,0 +1,180 @@
+"""Which figures a sweep's report shows, each with a caption that says n and kind, and words for who cannot see it."""
+
+from __future__ import annotations
+
+import pandas as pd
+
+from study import claims, figures, stats
+from study.figures import Drawing
+from study.result import SweepRecord
+from study.summary import Numbers
+
+HEAD_WORDS = {"rec": "reconstruction", "pred": "prediction", "plan": "planning"}
+
+
+def draw(record: SweepRecord, made: Numbers) -> list[Drawing]:
+    """The figures that the finished cells allow (PAPER.md section 4), each with a caption that says n and kind."""
+    if not record.results:
+        return []
+    if len(record.grid.fractions) > 1:
+        own = [*_speed(record, made), *_fractions(made)]
+    else:
+        own = [_heads(record, made, "test", "main"), _heads(record, made, "train", "train")]
+    return [*own, *_differences(made), *_pictures(record, made)]
+
+
+def _bands(made: Numbers) -> str:
+    """What lines and bands are, with n."""
+    counts = sorted({(score["n"], score["encoders"]) for score in made["scores"]})
+    if made["sweep"]["design"] == "A":
+        seeds = " or ".join(str(n) for n, _ in counts)
+        over, units = f"n = {seeds} policies on one encoder", "those policies"
+    else:
+        over = " or ".join(f"n = {n} policies on {encoders} encoders" for n, encoders in counts)
+        units = "the encoders"
+    return (
+        f"Line: mean over {over}. Light band: one standard deviation over all of them. Dark band: 95 % interval of the "
+        f"mean (Student's t, over {units})."
+    )
+
+
+def _heads(record: SweepRecord, made: Numbers, split: str, place: str) -> Drawing:
+    table, floor = record.table(), made["floor"]
+    steering, accuracy = (stats.curve_bands(table, metric, split) for metric in (stats.STEERING, stats.ACCURACY))
+    names = ", ".join(score["cell"] for score in made["scores"])
+    alt = "; ".join(f"{score['cell']} ends at {100 * score['accuracy']['mean']:.1f} %" for score in made["scores"])
+    return Drawing(
+        f"{split}_compare_heads",
+        place,
+        f"Policies on frozen encoders by epoch, {split} split: (a) steering loss, (b) acceleration accuracy, for "
+        f"encoders trained with {names}. {_bands(made)} The accuracy axis is cut; the first epochs begin below it. "
+        f"The paper's fig:{split}_compare_heads.",
+        f"Two line charts of steering loss and acceleration accuracy by epoch on the {split} split. On test {alt}.",
+        figures.compare_heads(steering, accuracy, floor["steering"], floor["accuracy"], split),
+    )
+
+
+def _speed(record: SweepRecord, made: Numbers) -> list[Drawing]:
+    bands = stats.curve_bands(record.table(), stats.ACCURACY)
+    base, floor = made["sweep"]["baseline"], made["floor"]["accuracy"]
+    full = [row for row in made["convergence"] if row["heads"] == "full"]
+    if not full:
+        return []
+    epochs = {row["fraction"]: row["mean_curve"]["value"] for row in full}
+    reached = {fraction: float("inf") if epoch == "never" else epoch for fraction, epoch in epochs.items()}
+    told = "; ".join(f"{100 * fraction:g} %: {epoch}" for fraction, epoch in epochs.items())
+    return [
+        Drawing(
+            "datasize_convergespeed",
+            "main",
+            f"Test acceleration accuracy by policy epoch: full at every data fraction against {base} at the largest. "
+            f"{_bands(made)} Dotted: {base}'s final accuracy (mean of its last {stats.LAST} epochs) and the epoch at "
+            "which each mean curve first reaches it. The axis is cut. The paper's fig:datasize_convergespeed.",
+            f"Line chart. Epoch at which full reaches {base}'s final accuracy, by fraction: {told}.",
+            figures.converge_speed(bands, base, reached, floor),
+        )
+    ]
+
+
+def _fractions(made: Numbers) -> list[Drawing]:
+    names = {"accuracy": stats.ACCURACY, "steering": stats.STEERING}
+    rows = [
+        {"metric": metric, "heads": score["heads"], "fraction": score["fraction"], **score[name]}
+        for name, metric in names.items()
+        for score in made["scores"]
+    ]
+    told = "; ".join(f"{score['cell']} {100 * score['accuracy']['mean']:.1f} %" for score in made["scores"])
+    kind = made["scores"][0]["accuracy"]["kind"]
+    return [
+        Drawing(
+            "datasize_compare",
+            "fractions",
+            f"Test (a) steering loss and (b) acceleration accuracy, mean of the last {stats.LAST} epochs, by share of "
+            f"the encoder's training data. Thin bar: one standard deviation over {_over(made)}; thick bar: 95 % "
+            f"interval of the mean ({kind}). The accuracy axis is cut. The paper's fig:datasize_compare.",
+            f"Two dot plots by data fraction. Accuracy: {told}.",
+            figures.compare_fractions(
+                pd.DataFrame(rows).astype({"sd": float, "low": float, "high": float}),
+                made["floor"]["steering"],
+                made["floor"]["accuracy"],
+            ),
+        )
+    ]
+
+
+def _over(made: Numbers) -> str:
+    counts = sorted({score["n"] for score in made["scores"]})
+    return f"n = {' or '.join(str(count) for count in counts)} policies"
+
+
+def _differences(made: Numbers) -> list[Drawing]:
+    rows = [row for row in made["comparisons"] if row["metric"] == stats.ACCURACY]
+    if not rows or rows[0]["difference"]["low"] is None:
+        return []
+    allowance = made["rules"]["encoder_allowance"] if made["sweep"]["design"] == "A" else 0.0
+    zone = f" Grey zone: the ±{100 * allowance:g} points that two encoders may differ by their seeds alone." * bool(
+        allowance
+    )
+    counts = sorted({row["difference"]["n"] for row in rows})
+    return [
+        Drawing(
+            "paired_differences",
+            "differences",
+            "Differences in final test acceleration accuracy, paired by seed, "
+            f"n = {' or '.join(map(str, counts))} pairs. "
+            f"Thick bar: 95 % interval ({rows[0]['difference']['kind']}). Thin bar: t interval for all {len(rows)} "
+            f"contrasts together.{zone}",
+            "Dot plot of paired differences. "
+            + "; ".join(f"{row['name']}: {100 * row['difference']['value']:+.2f} points" for row in rows),
+            figures.differences(
+                [
+                    {
+                        "name": row["name"],
+                        **{name: row["difference"][name] for name in ("value", "low", "high")},
+                        "low_all": row["simultaneous"][0],
+                        "high_all": row["simultaneous"][1],
+                    }
+                    for row in rows
+                ],
+                allowance,
+            ),
+        )
+    ]
+
+
+def _pictures(record: SweepRecord, made: Numbers) -> list[Drawing]:
+    """What the decoders of one encoder of each kind make of test frames."""
+    top = max(record.grid.fractions)
+    found = {name: results[0] for name in made["sweep"]["heads"] if (results := claims.results_at(record, (name, top)))}
+    drawings = []
+    if "rec" in found:
+        samples = found["rec"].samples
+        drawings.append(
+            Drawing(
+                "single_head_rec",
+                "pictures",
+                "Test frames (first row) and what the single-head autoencoder (rec) makes of them. The paper's "
+                "fig:single_head_rec.",
+                "Two rows of bird-view pictures: inputs, and their reconstructions by the single-head network.",
+                figures.picture_rows([("input", samples["input"]), ("reconstruction", samples["rec_output"])]),
+            )
+        )
+    if "full" in found:
+        samples, rows = found["full"].samples, []
+        for head, word in HEAD_WORDS.items():
+            rows += [("input", samples["input"]), (word, samples[f"{head}_output"])]
+            rows += [(f"{word} target", samples[f"{head}_target"])] if f"{head}_target" in samples else []
+            rows.append(("", samples["input"]))
+        drawings.append(
+            Drawing(
+                "multi_results",
+                "pictures",
+                "The same test frames through the multi-head network (full): for each head its input, its output and, "
+                "for prediction (other agents over the next second) and planning (the ego vehicle over the next "
+                "second), the target. The reconstruction's target is its input. The paper's fig:multi_results.",
+                "Rows of bird-view pictures: inputs, reconstructions, predicted masks with their targets, planned "
+                "masks with their targets, by the three-head network.",
+                figures.picture_rows(rows[:-1]),
+            )
+        )
+    return drawings

@@ -1,0 +1,345 @@
+"""One function for each figure: numbers or pictures in, a matplotlib Figure out. No statistic is computed here.
+
+Colours are those of Okabe and Ito (told apart by colour-blind readers), one for each head set everywhere; line styles
+and markers differ too, so that a grey print is readable. Curves are labelled where they end.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+from numpy.typing import NDArray
+
+from study.config import HEAD_SETS
+
+COLOUR = {"rec": "#000000", "rec+pred": "#E69F00", "rec+plan": "#0072B2", "full": "#D55E00"}
+LINE = {"rec": "-", "rec+pred": "-.", "rec+plan": "--", "full": "-"}
+MARKER = {"rec": "o", "rec+pred": "^", "rec+plan": "s", "full": "D"}
+FRACTION_COLOUR = ("#D55E00", "#E69F00", "#009E73", "#56B4E9", "#CC79A7")
+FRACTION_MARKER = ("D", "^", "s", "v", "P")
+GREY = "#666666"
+WIDTH = 6.4  # [in], the report's text width
+LATE = 0.05  # share of the epochs after which the axis of a curve shows everything
+STYLE: dict[Any, Any] = {
+    "font.size": 7.5,
+    "font.family": "DejaVu Sans",  # comes with matplotlib, so every machine draws the same
+    "axes.titlesize": 8,
+    "axes.titlelocation": "left",
+    "axes.labelsize": 7.5,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.6,
+    "axes.edgecolor": "#444444",
+    "xtick.labelsize": 7,
+    "ytick.labelsize": 7,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "lines.linewidth": 1.2,
+    "lines.markersize": 3.2,
+    "svg.hashsalt": "study",
+    "svg.fonttype": "path",
+    "figure.dpi": 100,
+}
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A figure: its file name, where it belongs in the report, what it shows, and the same in words."""
+
+    name: str
+    place: str
+    caption: str
+    alt: str
+    figure: Figure
+
+
+def save(figure: Figure, folder: Path, name: str) -> tuple[Path, Path]:
+    """Write a figure as `name.svg` and `name.png` (200 dots per inch), the same bytes each time."""
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for kind, metadata in (("svg", {"Date": None, "Creator": None}), ("png", {"Software": None})):
+        stream = io.BytesIO()
+        with mpl.rc_context(STYLE):
+            figure.savefig(stream, format=kind, dpi=200, metadata=metadata)
+        path = folder / f"{name}.{kind}"
+        draft = path.with_name(f".{path.name}")
+        draft.write_bytes(stream.getvalue())
+        draft.replace(path)
+        paths.append(path)
+    return paths[0], paths[1]
+
+
+def _figure(height: float, columns: int = 1, rows: int = 1) -> tuple[Figure, list[Axes]]:
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False)
+    return figure, list(axes.flat)
+
+
+# --- curves ---------------------------------------------------------------------------------------------------------
+
+
+def compare_heads(
+    steering: pd.DataFrame,
+    accuracy: pd.DataFrame,
+    steering_floor: float,
+    accuracy_floor: float,
+    split: str = "test",
+) -> Figure:
+    """Steering loss and acceleration accuracy by epoch (fig:test_compare_heads, fig:train_compare_heads).
+
+    Both tables are those of `study.stats.curve_bands` at one fraction: mean line, band of one standard deviation over
+    seeds, darker band for the 95 % interval of the mean.
+    """
+    with mpl.rc_context(STYLE):
+        figure, (left, right) = _figure(2.6, columns=2)
+        for axes, bands, scale in ((left, steering, 1.0), (right, accuracy, 100.0)):
+            for index, (name, rows) in enumerate(bands.groupby("heads", sort=False)):
+                _curve(axes, rows, scale, COLOUR[str(name)], LINE[str(name)], MARKER[str(name)], index)
+            axes.set_xlabel("policy epoch")
+        left.set_title(f"(a) Steering loss, {split}")
+        _loss_axis(left, steering, steering_floor)
+        right.set_title(f"(b) Acceleration accuracy, {split}")
+        _accuracy_axis(right, accuracy, accuracy_floor)
+        for axes, bands, scale in ((left, steering, 1.0), (right, accuracy, 100.0)):
+            last = bands[bands["epoch"] == bands["epoch"].max()]
+            ends = zip(last["mean"] * scale, last["heads"], strict=True)
+            _label_ends(axes, [(float(value), str(heads), COLOUR[str(heads)]) for value, heads in ends])
+    return figure
+
+
+def converge_speed(
+    accuracy: pd.DataFrame, baseline: str, reached: Mapping[float, float], accuracy_floor: float
+) -> Figure:
+    """Test accuracy by epoch: full at every fraction against the baseline at the largest (fig:datasize_convergespeed).
+
+    `accuracy`: `study.stats.curve_bands`; `reached`: fraction -> epoch at which full's mean curve reaches the
+    baseline's final accuracy, infinite when never.
+    """
+    with mpl.rc_context(STYLE):
+        figure, (axes,) = _figure(3.4)
+        top = accuracy["fraction"].max()
+        base = accuracy[(accuracy["heads"] == baseline) & (accuracy["fraction"] == top)]
+        others = accuracy[accuracy["heads"] == "full"]
+        ends = []
+        for index, (fraction, rows) in enumerate(others.groupby("fraction", sort=False)):
+            colour, marker = (marks[index % len(marks)] for marks in (FRACTION_COLOUR, FRACTION_MARKER))
+            _curve(axes, rows, 100.0, colour, "-", marker, index)
+            ends.append((100 * float(rows["mean"].iloc[-1]), f"full, {_percent(fraction)}", colour))
+        _curve(axes, base, 100.0, COLOUR[baseline], "--", MARKER[baseline], 0)
+        ends.append((100 * float(base["mean"].iloc[-1]), f"{baseline}, {_percent(top)}", COLOUR[baseline]))
+        shown = pd.concat([others, base])
+        _accuracy_axis(axes, shown, accuracy_floor)
+        goal = 100 * float(base["mean"].iloc[-5:].mean())
+        axes.axhline(goal, color=GREY, linewidth=0.6, linestyle=":")
+        for index, fraction in enumerate(others["fraction"].unique()):
+            epoch = reached.get(float(fraction), np.inf)
+            if np.isfinite(epoch):
+                colour = FRACTION_COLOUR[index % len(FRACTION_COLOUR)]
+                axes.plot([epoch, epoch], [axes.get_ylim()[0], goal], color=colour, linewidth=0.6, linestyle=":")
+        axes.set_xlabel("policy epoch")
+        axes.set_ylabel("acceleration accuracy, test [%]")
+        _label_ends(axes, ends)
+    return figure
+
+
+def _curve(axes: Axes, rows: pd.DataFrame, scale: float, colour: str, line: str, marker: str, index: int) -> None:
+    """Mean line, band of one standard deviation, darker band for the interval of the mean."""
+    epoch, mean, sd, low, high = (rows[name].to_numpy(np.float64) for name in ("epoch", "mean", "sd", "low", "high"))
+    axes.fill_between(epoch, scale * (mean - sd), scale * (mean + sd), color=colour, alpha=0.15, linewidth=0)
+    axes.fill_between(epoch, scale * low, scale * high, color=colour, alpha=0.3, linewidth=0)
+    every = max(len(epoch) // 8, 1)
+    axes.plot(epoch, scale * mean, line, color=colour, marker=marker, markevery=(index * every // 5, every))
+    axes.set_xlim(0, 1.01 * epoch.max())
+
+
+def _settled(bands: pd.DataFrame) -> pd.DataFrame:
+    """The curves without the first epochs, which would press everything else together."""
+    late: pd.DataFrame = bands[bands["epoch"] > LATE * bands["epoch"].max()]
+    return late
+
+
+def _loss_axis(axes: Axes, bands: pd.DataFrame, floor: float) -> None:
+    """From 0; the best constant command's loss as a line, or in words where it is far above."""
+    high = 1.15 * float((_settled(bands)["mean"] + _settled(bands)["sd"].fillna(0)).max())
+    axes.set_ylim(0, high)
+    axes.ticklabel_format(axis="y", style="sci", scilimits=(-2, 2), useMathText=True)
+    axes.set_ylabel("smooth L1 loss")
+    if floor <= high:
+        axes.axhline(floor, color=GREY, linewidth=0.6, linestyle=":")
+        axes.text(axes.get_xlim()[1], floor, "best constant ", color=GREY, fontsize=6.5, ha="right", va="bottom")
+    else:
+        axes.text(
+            0.98, 0.97, f"best constant: {floor:.2g}, above", transform=axes.transAxes, color=GREY, fontsize=6.5,
+            ha="right", va="top",
+        )  # fmt: skip
+
+
+def _accuracy_axis(axes: Axes, bands: pd.DataFrame, floor: float) -> None:
+    """Cut below the curves, and says so: the majority class's accuracy is named where it is not in sight."""
+    part = _settled(bands)
+    low = 100 * float((part["mean"] - part["sd"].fillna(0)).min())
+    high = 100 * float((part["mean"] + part["sd"].fillna(0)).max())
+    pad = 0.06 * (high - low)
+    low, high = max(low - 2 * pad, 0), min(high + pad, 100)
+    axes.set_ylim(low, high)
+    axes.set_ylabel("accuracy [%]")
+    if 100 * floor >= low:
+        axes.axhline(100 * floor, color=GREY, linewidth=0.6, linestyle=":")
+        axes.text(axes.get_xlim()[1], 100 * floor, "majority class ", color=GREY, fontsize=6.5, ha="right", va="bottom")
+    else:
+        note = f"axis cut; majority class at {100 * floor:.1f} %"
+        axes.text(0.98, 0.03, note, transform=axes.transAxes, color=GREY, fontsize=6.5, ha="right", va="bottom")
+
+
+def _label_ends(axes: Axes, ends: Sequence[tuple[float, str, str]]) -> None:
+    """Names (value, text, colour) at the right end of their curves, moved apart where they would touch."""
+    low, high = axes.get_ylim()
+    gap, ordered = 0.07, sorted(ends)
+    wanted = [(value - low) / (high - low) for value, _, _ in ordered]
+    places = list(wanted)
+    for _ in range(100):
+        for index in range(len(places) - 1):
+            lack = gap - (places[index + 1] - places[index])
+            if lack > 0:
+                places[index] -= lack / 2
+                places[index + 1] += lack / 2
+    lift = max(0.02 - places[0], 0) + min(1.02 - places[-1], 0) if places else 0
+    for (value, text, colour), place in zip(ordered, places, strict=True):
+        axes.annotate(
+            text,
+            (axes.get_xlim()[1], value),
+            (1.05, place + lift),
+            textcoords="axes fraction",
+            color=colour,
+            va="center",
+            fontsize=7,
+            annotation_clip=False,
+            arrowprops={"arrowstyle": "-", "color": colour, "linewidth": 0.5, "shrinkA": 1, "shrinkB": 0},
+        )
+
+
+def _percent(fraction: object) -> str:
+    return f"{float(str(fraction)) * 100:g} %"
+
+
+# --- by data fraction -----------------------------------------------------------------------------------------------
+
+
+def compare_fractions(scores: pd.DataFrame, steering_floor: float, accuracy_floor: float) -> Figure:
+    """Mean of the last five epochs by data fraction (fig:datasize_compare).
+
+    `scores`: one row for each cell and metric, columns metric (steering_loss, acceleration_accuracy), heads, fraction,
+    mean, sd, low, high. Thin bar: one standard deviation over seeds; thick bar: 95 % interval of the mean.
+    """
+    with mpl.rc_context(STYLE):
+        figure, panels = _figure(2.6, columns=2)
+        titles = ("(a) Steering loss, test", "(b) Acceleration accuracy, test")
+        for axes, metric, scale, title in zip(
+            panels, ("steering_loss", "acceleration_accuracy"), (1.0, 100.0), titles, strict=True
+        ):
+            own, ends = scores[scores["metric"] == metric], []
+            for index, (name, rows) in enumerate(own.groupby("heads", sort=False)):
+                heads, points = str(name), rows.sort_values("fraction")
+                ends.append((scale * float(points["mean"].iloc[-1]), heads, COLOUR[heads]))
+                _bars(axes, points, scale, heads, shift=1 + 0.03 * index)
+            axes.set_xscale("log")
+            ticks = sorted(own["fraction"].unique())
+            axes.xaxis.set_major_locator(FixedLocator(ticks))
+            axes.xaxis.set_minor_locator(NullLocator())
+            axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value * 100:g}"))
+            axes.set_xlim(ticks[0] / 1.2, ticks[-1] * 1.2)
+            axes.set_xlabel("share of the encoder's training data [%]")
+            axes.set_title(title)
+            bands = own.assign(epoch=1)
+            if metric == "steering_loss":
+                _loss_axis(axes, bands, steering_floor)
+            else:
+                _accuracy_axis(axes, bands, accuracy_floor)
+            _label_ends(axes, ends)
+    return figure
+
+
+def _bars(axes: Axes, rows: pd.DataFrame, scale: float, heads: str, shift: float) -> None:
+    x, mean, sd, low, high = (rows[name].to_numpy(np.float64) for name in ("fraction", "mean", "sd", "low", "high"))
+    colour = COLOUR[heads]
+    axes.plot(x * shift, scale * mean, LINE[heads], color=colour, marker=MARKER[heads])
+    axes.vlines(x * shift, scale * (mean - sd), scale * (mean + sd), color=colour, linewidth=0.7)
+    axes.vlines(x * shift, scale * low, scale * high, color=colour, linewidth=2.2, alpha=0.6)
+
+
+# --- differences ----------------------------------------------------------------------------------------------------
+
+
+def differences(rows: Sequence[Mapping[str, float | str]], allowance: float) -> Figure:
+    """Paired differences in accuracy [points]: thick bar 95 % interval, thin bar simultaneous interval.
+
+    Each row has name, value, low, high, low_all, high_all (shares, not points). The grey zone is the allowance for
+    other encoders, 0 for none.
+    """
+    with mpl.rc_context(STYLE):
+        figure, (axes,) = _figure(0.7 + 0.24 * len(rows))
+        axes.axvspan(-100 * allowance, 100 * allowance, color=GREY, alpha=0.15, linewidth=0)
+        axes.axvline(0, color=GREY, linewidth=0.6)
+        for index, row in enumerate(rows):
+            value, low, high, least, most = (
+                100 * float(row[name]) for name in ("value", "low", "high", "low_all", "high_all")
+            )
+            axes.hlines(index, least, most, color=COLOUR["rec+plan"], linewidth=0.8)
+            axes.hlines(index, low, high, color=COLOUR["rec+plan"], linewidth=2.6)
+            axes.plot(value, index, "o", color=COLOUR["rec"], markersize=3.5)
+        axes.set_yticks(range(len(rows)), [str(row["name"]) for row in rows])
+        axes.set_ylim(len(rows) - 0.4, -0.6)
+        axes.spines["left"].set_visible(False)
+        axes.tick_params(axis="y", length=0)
+        axes.set_xlabel("difference in acceleration accuracy, test [percentage points]")
+    return figure
+
+
+# --- pictures -------------------------------------------------------------------------------------------------------
+
+Rows = Sequence[tuple[str, NDArray[np.uint8]]]
+
+
+def picture_rows(rows: Rows, columns: int = 8) -> Figure:
+    """Rows of test pictures with their names (fig:single_head_rec, fig:multi_results).
+
+    Each row is a name and pictures [K, 64, 64, 3] or [K, 64, 64] uint8; an empty name is a gap.
+    """
+    shown = [(name, pictures[:columns]) for name, pictures in rows]
+    columns = max(len(pictures) for _, pictures in shown)
+    name_width, gap, space = 1.15, 0.03, 0.12
+    side = (WIDTH - name_width) / columns
+    spaces = sum(name == "" for name, _ in shown)
+    height = side * (len(shown) - spaces) + space * spaces
+    figure = Figure(figsize=(WIDTH, height))
+    top = height
+    with mpl.rc_context(STYLE):
+        for name, pictures in shown:
+            if name == "":
+                top -= space
+                continue
+            figure.text(0, (top - side / 2) / height, name, va="center", fontsize=7.5)
+            for column, picture in enumerate(pictures):
+                left, bottom = name_width + column * side, top - side
+                axes = figure.add_axes(
+                    (left / WIDTH, bottom / height, (side - gap) / WIDTH, (side - gap) / height), frame_on=False
+                )
+                axes.imshow(picture, cmap="gray", vmin=0, vmax=255, interpolation="nearest")
+                axes.set_axis_off()
+            top -= side
+    return figure
+
+
+def known_order(heads: Sequence[str]) -> list[str]:
+    """Head sets in the order of the study."""
+    return [name for name in HEAD_SETS if name in heads]

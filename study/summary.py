@@ -1,0 +1,312 @@
+"""Every number of a report, from a sweep's record, as one plain value: what the PDF prints is in here and no more."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from study import claims, stats
+from study.config import ACCELERATIONS, HEAD_SETS, parameter_counts
+from study.result import SweepRecord
+from study.stats import Estimate, Panel, Point
+
+FORMAT_VERSION = 1
+SHOWN_PACKAGES = ("torch", "lightning", "highway-env", "gymnasium", "numpy", "scipy", "mlflow", "optuna", "typst")
+SIMULATOR = "a town of our own on highway-env, in the place of CARLA's Town03"
+METRICS = {"accuracy": stats.ACCURACY, "steering": stats.STEERING, "balanced": "balanced_accuracy"}
+
+Numbers = dict[str, Any]
+
+
+def numbers(record: SweepRecord) -> Numbers:
+    """Every number of the report as plain values: NaN is None, an epoch that is never reached is "never"."""
+    grid, table = record.grid, record.table()
+    panels = {name: stats.panel(table, metric) for name, metric in METRICS.items()}
+    accuracy, steering = panels["accuracy"], panels["steering"]
+    points = [point for point in _points(record) if point in accuracy]
+    base = (grid.baseline, max(grid.fractions))
+    verdicts = [
+        verdict
+        for verdict in claims.judge(record)
+        if verdict.claim in grid.claims or (not grid.claims and (verdict.findings or verdict.missing))
+    ]
+    floor = _floors(record)
+    made: Numbers = {
+        "format_version": FORMAT_VERSION,
+        "sweep": _sweep(record, stats.design(accuracy.values())),
+        "floor": floor,
+        "scores": [_score(record, point, panels, floor["accuracy"]) for point in points],
+        "comparisons": [
+            _contrast(record, contrast)
+            for metric, curves in ((stats.ACCURACY, accuracy), (stats.STEERING, steering))
+            for contrast in claims.compare(record, metric, curves)
+        ],
+        "convergence": [
+            _convergence(record, point, accuracy[point], accuracy[base]) for point in points if base in accuracy
+        ],
+        "components": [
+            {"cell": claims.label(point, grid), **stats.variance_components(accuracy[point])} for point in points
+        ],
+        "encoders": _encoders(record, table),
+        "claims": verdicts,
+        "rules": grid.rules.model_dump(mode="json"),
+        "settings": _settings(record),
+        "parameters": parameter_counts(),
+        "data": _data(record),
+        "cost": _cost(record),
+        "provenance": _provenance(record),
+    }
+    made["sweep"]["summary"] = _summary(made, verdicts)
+    plain: Numbers = _plain(made)
+    return plain
+
+
+def _plain(value: Any) -> Any:
+    """Values of JSON."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(name): _plain(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if hasattr(value, "item"):  # numpy's scalars
+        value = value.item()
+    if isinstance(value, float):
+        return None if math.isnan(value) else value if math.isfinite(value) else "never"
+    return value
+
+
+def _points(record: SweepRecord) -> list[Point]:
+    """Head sets and fractions of the plan: most data first, head sets in the order of the study."""
+    heads = [name for name in HEAD_SETS if name in record.grid.heads]
+    return [(name, fraction) for fraction in sorted(record.grid.fractions, reverse=True) for name in heads]
+
+
+def _sweep(record: SweepRecord, design: str) -> Numbers:
+    grid = record.grid
+    unfinished = [
+        cell for key, cell in record.planned.items() if key not in record.results and key not in record.failed
+    ]
+    return {
+        "name": grid.name,
+        "title": grid.title,
+        "simulator": SIMULATOR,
+        "profile": record.profile,
+        "design": design,
+        "encoder_seeds": grid.encoder_seeds,
+        "policy_seeds": grid.policy_seeds,
+        "policy_epochs": record.settings.policy.epochs,
+        "baseline": grid.baseline,
+        "heads": [name for name in HEAD_SETS if name in grid.heads],
+        "fractions": sorted(grid.fractions, reverse=True),
+        "planned": len(record.planned),
+        "finished": sum(key in record.results for key in record.planned),
+        "unfinished": [cell.label for cell in unfinished],
+        "failed": [
+            {
+                "cell": record.planned[key].label,
+                "reason": reason.strip().splitlines()[-1][:300] if reason.strip() else "",
+            }
+            for key, reason in record.failed.items()
+            if key in record.planned and key not in record.results
+        ],
+    }
+
+
+def _floors(record: SweepRecord) -> Numbers:
+    """What no learning at all gives on the test frames."""
+    for key, cell in record.planned.items():
+        if key in record.results:
+            steering = claims.steering_floor(record, (cell.heads, cell.fraction))
+            return {"accuracy": record.results[key].facts["floor"], "steering": steering}
+    return {"accuracy": math.nan, "steering": math.nan}
+
+
+def _score(record: SweepRecord, point: Point, panels: Mapping[str, Panel], floor: float) -> Numbers:
+    results = claims.results_at(record, point)
+    guesses = [(item.predictions["acceleration"], item.predictions["acceleration_label"]) for item in results]
+    recall = np.concatenate([stats.confusion(guess, label) for guess, label in guesses]).mean(axis=0)
+    accuracy = panels["accuracy"][point]
+    scored = {name: _spread(curves[point]) for name, curves in panels.items() if point in curves}
+    return {
+        "cell": claims.label(point, record.grid),
+        "heads": point[0],
+        "fraction": point[1],
+        "encoders": stats.encoders(accuracy),
+        "n": len(accuracy),
+        **scored,
+        "gain": scored["accuracy"]["mean"] - floor,
+        "macro_f1": float(np.concatenate([stats.macro_f1(guess, label) for guess, label in guesses]).mean()),
+        "confusion": recall.tolist(),
+        "classes": list(ACCELERATIONS),
+    }
+
+
+def _spread(curves: pd.DataFrame) -> Numbers:
+    final = stats.final(curves)
+    found = stats.mean_interval(final)
+    middle = float(stats.interquartile_mean(final.to_numpy()))
+    sd = float(final.std(ddof=1)) if len(final) > 1 else math.nan
+    return {"mean": found.value, "sd": sd, "iqm": middle, **_interval(found)}
+
+
+def _interval(found: Estimate) -> Numbers:
+    return {"low": found.low, "high": found.high, "n": found.n, "kind": found.kind}
+
+
+def _contrast(record: SweepRecord, contrast: claims.Contrast) -> Numbers:
+    names = [claims.label(point, record.grid) for point in (contrast.first, contrast.second)]
+    return {"name": f" {claims.MINUS} ".join(names), **dataclasses.asdict(contrast)}
+
+
+def _convergence(record: SweepRecord, point: Point, curves: pd.DataFrame, base: pd.DataFrame) -> Numbers:
+    target = float(stats.final(base).mean())
+    by_seed = stats.reach_by_seed(curves, target)
+    return {
+        "cell": claims.label(point, record.grid),
+        "fraction": point[1],
+        "heads": point[0],
+        "target": target,
+        "mean_curve": stats.epochs_to_reach(curves, base),
+        "median": by_seed.median,
+        "share": by_seed.share,
+        "area": by_seed.area,
+        "n": len(curves),
+    }
+
+
+def _encoders(record: SweepRecord, table: pd.DataFrame) -> list[Numbers]:
+    """Losses of the encoders' heads after the last epoch, mean over encoder seeds."""
+    rows = table[table["stage"] == "encoder"]
+    made = []
+    for heads, fraction in _points(record):
+        own = rows[(rows["heads"] == heads) & (rows["fraction"] == fraction)]
+        if own.empty:
+            continue
+        last = own[own["epoch"] == own["epoch"].max()].groupby(["metric", "split"])["value"].mean()
+        losses = {
+            head: {split: last.get((f"loss_{head}", split), math.nan) for split in ("train", "test")}
+            for head in HEAD_SETS[heads]
+        }
+        count = own["encoder_seed"].nunique()
+        made.append({"cell": claims.label((heads, fraction), record.grid), "encoders": count, "losses": losses})
+    return made
+
+
+def _settings(record: SweepRecord) -> list[Numbers]:
+    """Every setting with its meaning and whether it differs from the program's default."""
+    rows = []
+    for group, model in record.settings:
+        for name, info in type(model).model_fields.items():
+            value = getattr(model, name)
+            shown = model.model_dump(mode="json")[name]
+            rows.append(
+                {
+                    "group": group,
+                    "name": name,
+                    "value": shown if isinstance(shown, str) else json.dumps(shown),
+                    "meaning": info.description or "",
+                    "default": value == info.get_default(call_default_factory=True),
+                }
+            )
+    return rows
+
+
+def _data(record: SweepRecord) -> Numbers:
+    """Of the manifest: frames, drives, labels before and after balancing."""
+    sets = record.data.get("sets", {})
+    return {
+        "key": record.data.get("key"),
+        "sets": {
+            name: {
+                "drives": len(record.data.get("sources", {}).get(name, ())),
+                "test_drives": _count(content.get("test_drives")),
+                **{field: content.get(field) for field in ("frames", "train", "test")},
+                "candidates": content.get("candidates"),
+                "chosen": content.get("chosen"),
+            }
+            for name, content in sets.items()
+        },
+    }
+
+
+def _count(value: Any) -> Any:
+    return len(value) if isinstance(value, list) else value
+
+
+def _cost(record: SweepRecord) -> Numbers:
+    rows = []
+    for key, cell in record.planned.items():
+        if key not in record.results:
+            continue
+        facts = record.results[key].facts
+        seconds = facts.get("seconds", {})
+        rows.append(
+            {
+                "cell": cell.label,
+                **{stage: seconds.get(stage) for stage in ("encoder", "encode", "policies", "cell")},
+                "peak_bytes": facts.get("peak_bytes"),
+                **{name: facts.get(name) for name in ("device", "precision", "threads")},
+                "frames": facts.get("frames", {}).get("encoder_train"),
+            }
+        )
+    return {
+        "cells": rows,
+        "seconds": sum(row["cell"] or 0.0 for row in rows),
+        "peak_bytes": max((row["peak_bytes"] or 0 for row in rows), default=None),
+    }
+
+
+def _provenance(record: SweepRecord) -> Numbers:
+    """Of the sweep, and whether all its cells come from the same commit."""
+    own = record.provenance
+    packages = own.get("packages", {})
+    commits = {
+        str(found["commit"])
+        for result in record.results.values()
+        if (found := result.facts.get("provenance", {})).get("commit")
+    }
+    return {
+        **{name: own.get(name) for name in ("commit", "dirty", "lock", "python", "platform", "cpu", "cores")},
+        "diff_lines": len(str(own.get("diff") or "").splitlines()),
+        "packages": {name: packages[name] for name in SHOWN_PACKAGES if name in packages},
+        "cell_commits": sorted(commits),
+        "keys": {cell.label: key for key, cell in record.planned.items()},
+    }
+
+
+def _summary(made: Numbers, verdicts: Sequence[claims.Verdict]) -> list[str]:
+    """The first page in words."""
+    sweep, floor = made["sweep"], made["floor"]
+    lines = []
+    if verdicts:
+        counts = {outcome: [item.claim for item in verdicts if item.outcome == outcome] for outcome in claims.OUTCOMES}
+        told = [f"{len(names)} {outcome} ({', '.join(names)})" for outcome, names in counts.items() if names]
+        lines.append(f"Of {len(verdicts)} claims that this sweep tests: {'; '.join(told)}.")
+    if made["scores"]:
+        shown = [
+            score for score in made["scores"] if score["fraction"] in (sweep["fractions"][0], sweep["fractions"][-1])
+        ]
+        values = [
+            f"{score['cell']} {100 * score['accuracy']['mean']:.1f} % (sd {100 * score['accuracy']['sd']:.2f})"
+            for score in shown
+        ]
+        lines.append(
+            f"Acceleration accuracy on test drives, mean of the last {stats.LAST} of {sweep['policy_epochs']} epochs, "
+            f"mean and sd over {_seeds(made['scores'][0])}: {'; '.join(values)}. "
+            f"Always saying the commonest class gives {100 * floor['accuracy']:.1f} %."
+        )
+    return lines
+
+
+def _seeds(score: Numbers) -> str:
+    count, encoders = score["n"], score["encoders"]
+    if encoders == 1:
+        return f"{count} policies on one encoder"
+    return f"{count} policies on {encoders} encoders"
