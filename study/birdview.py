@@ -59,7 +59,7 @@ def render_birdview(
 
 def check_rate(episode: Episode) -> None:
     """Raise BadInputError for an Episode that is not at 10 Hz, the rate of history and future (Sec. III-A)."""
-    if episode.rate_hz != RATE_HZ:
+    if abs(episode.rate_hz - RATE_HZ) > 0.01:
         raise BadInputError(
             f"Episode {episode.id} has {episode.rate_hz:g} steps per second; bird views need {RATE_HZ:g}: "
             "resample it with 'python -m study.data import'"
