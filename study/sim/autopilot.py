@@ -95,6 +95,7 @@ class Fleet:
         self.move_signal = np.array([town.signal_of[move.entry] for move in moves], np.int64)
         self.move_length = np.array([move.length for move in moves])
         self.street_length = np.array([strip.piece.length for strip in town.strips])
+        self.load = np.zeros(len(town.strips))  # vehicles that are on a strip or plan to come
         across = np.where(town.opposing, town.enter, np.inf)
         self.first_crossing = np.nan_to_num(across, nan=np.inf).min(axis=1, initial=np.inf)
 
@@ -102,6 +103,8 @@ class Fleet:
 
     def place(self, slot: int, strip: int, s: float) -> None:
         """Give a vehicle a new route that starts on a street's strip, with the vehicle at `s` [m] of it."""
+        for gone in self.routes[slot][int(self.at[slot]) :]:
+            self.load[gone] -= 1
         self.routes[slot], self.starts[slot], self.turns[slot] = [], [], []
         self.ends[slot] = self.sampled[slot] = self.first[slot] = self.filled[slot] = self.at[slot] = 0
         self.s[slot], self.lateral[slot] = s, 0.0
@@ -117,13 +120,13 @@ class Fleet:
         self.routes[slot].append(strip)
         self.starts[slot].append(float(self.ends[slot]))
         self.ends[slot] += self.street_length[strip]
+        self.load[strip] += 1
 
     def _lengthen(self, slot: int) -> None:
         """Plan further where the plan gets short, and sample the way as far as it may be looked at."""
         signalled = bool(self.town.signals)
         while self.ends[slot] < self.s[slot] + AHEAD + 60 or (signalled and len(self.turns[slot]) < 2):
-            ways = self.town.ways[self.routes[slot][-1]]
-            number = ways[int(self.rng.integers(len(ways)))]
+            number = self._choose(self.town.ways[self.routes[slot][-1]])
             movement = self.town.movements[number]
             if self.town.phases[movement.node]:
                 self.turns[slot].append((number, float(self.ends[slot])))
@@ -139,6 +142,12 @@ class Fleet:
         while (self.first[slot] + self.filled[slot]) * SPACING < self.s[slot] + AHEAD + 60:
             self._sample(slot, int(self.sampled[slot]))
             self.sampled[slot] += 1
+
+    def _choose(self, ways: tuple[int, ...]) -> int:
+        """A turn at random; full streets are avoided, or rings of them would lock for ever."""
+        exits = self.move_exit[list(ways)]
+        free = np.maximum(1 - self.load[exits] * GAP / self.street_length[exits], 0.02) ** 2
+        return ways[int(np.searchsorted(np.cumsum(free), self.rng.random() * free.sum()))]
 
     def _sample(self, slot: int, number: int) -> None:
         start, filled = self.starts[slot][number], int(self.filled[slot])
@@ -178,6 +187,7 @@ class Fleet:
         self.s = (self.first + k) * SPACING + dx * c + dy * s
         self.lateral = dy * c - dx * s
         for slot in np.flatnonzero(self.s > self.strip_end).tolist():
+            self.load[self.strip[slot]] -= 1
             self.at[slot] += 1
             self._stand_on(slot)
         for slot in np.flatnonzero(self.s - LENGTH / 2 > self.move_end).tolist():
@@ -317,7 +327,8 @@ class Fleet:
         a, b = self.move[i], self.move[j]
         into_i, out_i, into_j, out_j = town.enter[a, b], town.leave[a, b], town.enter[b, a], town.leave[b, a]
         open_ = (front[i] - LENGTH < out_i) & (front[j] - LENGTH < out_j) & (front[i] <= into_i)
-        taken = (front[j] > into_j) & open_
+        begun = np.where(self.move_left[b], np.minimum(into_j, self.first_crossing[b]), into_j)
+        taken = (front[j] > begun) & open_
         across = town.opposing[a, b]
         yields = across & self.move_left[a] & ~self.move_left[b]
         # across: the left turn waits for whoever can be there before it is through
