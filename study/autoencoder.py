@@ -1,0 +1,726 @@
+"""Encoders trained with one, two or three decoder heads (Sec. III-B, IV-B), and the latents of a trained one.
+
+The main path is `train_encoder`: Lightning's Trainer over batches that are slices of one uint8 array. Images lie in the
+store as [N, 64, 64, 3], which is channels-last memory already; masks stay packed bits until they are on the device.
+A killed training goes on from its checkpoint and, on a CPU, ends with the bytes of one that was never killed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import hashlib
+import itertools
+import logging
+import math
+import os
+import pickle
+import signal
+import tempfile
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import lightning
+import numpy as np
+import pandas as pd
+import torch
+from lightning.fabric.plugins.environments.lightning import LightningEnvironment
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional
+
+from study.config import (
+    CHANNELS,
+    CORE,
+    HEAD_SETS,
+    HEADS,
+    IMAGE,
+    KERNEL,
+    LATENT,
+    STRIDE,
+    BadInputError,
+    EncoderSettings,
+    FramesSettings,
+    one_of,
+)
+from study.frames import Frames, epoch_order
+from study.result import Arrays, TrainingDivergedError
+
+Bytes = NDArray[np.uint8]
+Indices = NDArray[np.int64]
+Split = Literal["train", "test"]
+Log = Callable[[int, dict[str, float]], None]
+Progress = Callable[[int, int], None]
+
+MASKS = ("pred", "plan")  # order of the store's masks
+SAMPLES = 16
+CHECKPOINT_SECONDS = 60.0  # between two checkpoints of 23 MB: what a kill costs at most
+PROGRESS_SECONDS = 0.25
+RESIDENT_SHARE = 0.6  # of a GPU's free memory that the data may fill; the rest is for activations
+_CORE_NUMBERS = CHANNELS[-1] * CORE * CORE
+_PIXELS = HEADS["rec"] * IMAGE * IMAGE
+
+
+# --- networks -------------------------------------------------------------------------------------------------------
+
+
+class _Convolution(nn.Conv2d):
+    """A convolution before a BatchNorm, which takes its bias away again: the bias has no gradient to wait for."""
+
+    def forward(self, input: Tensor) -> Tensor:  # noqa: A002 - torch's name
+        bias = None if self.bias is None else self.bias.detach()
+        output: Tensor = self._conv_forward(input, self.weight, bias)
+        return output
+
+
+class _TransposedConvolution(nn.ConvTranspose2d):
+    """The same, transposed. Here the bias' gradient, zero but for rounding, took half of the backward time on a CPU."""
+
+    def forward(self, input: Tensor, output_size: list[int] | None = None) -> Tensor:  # noqa: A002, ARG002
+        bias = None if self.bias is None else self.bias.detach()
+        return functional.conv_transpose2d(input, self.weight, bias, STRIDE, output_padding=self.output_padding[0])
+
+
+class Encoder(nn.Module):
+    """Images to z: three convolutions and a fully connected layer (Sec. IV-B).
+
+    Input [B, 3, 64, 64] float in [0, 1], output z [B, 64]. With `variational`, one more layer gives log variances.
+    """
+
+    def __init__(self, variational: bool = False) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        for before, after in itertools.pairwise((HEADS["rec"], *CHANNELS)):
+            layers += [_Convolution(before, after, KERNEL, STRIDE), nn.BatchNorm2d(after), nn.ReLU()]
+        self.convolutions = nn.Sequential(*layers)
+        self.mean = nn.Linear(_CORE_NUMBERS, LATENT)
+        self.log_variance = nn.Linear(_CORE_NUMBERS, LATENT) if variational else None
+
+    def features(self, images: Tensor) -> Tensor:
+        """What the fully connected layers see: [B, 4608], pixel by pixel, as channels-last memory has it."""
+        features: Tensor = self.convolutions(images)
+        return features.permute(0, 2, 3, 1).flatten(1)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """The latent; its mean when variational."""
+        z: Tensor = self.mean(self.features(images))
+        return z
+
+
+class Decoder(nn.Module):
+    """z [B, 64] to the logits [B, channels, 64, 64] of one head, in float32: the encoder backwards (Sec. IV-B)."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.fully_connected = nn.Sequential(nn.Linear(LATENT, _CORE_NUMBERS), nn.BatchNorm1d(_CORE_NUMBERS), nn.ReLU())
+        layers: list[nn.Module] = []
+        # 6 -> 14 -> 31 -> 64 without padding: the middle layer needs one row and column more (PAPER.md 2.2)
+        for (before, after), extra in zip(itertools.pairwise(CHANNELS[::-1]), (0, 1), strict=True):
+            layers += [
+                _TransposedConvolution(before, after, KERNEL, STRIDE, output_padding=extra),
+                nn.BatchNorm2d(after),
+                nn.ReLU(),
+            ]
+        self.convolutions = nn.Sequential(*layers)
+        self.output = nn.ConvTranspose2d(CHANNELS[0], channels, KERNEL, STRIDE)
+
+    def forward(self, z: Tensor) -> Tensor:
+        """Logits; a sigmoid makes them the paper's output."""
+        core = self.fully_connected(z).view(-1, CORE, CORE, CHANNELS[-1]).permute(0, 3, 1, 2)
+        # The bias is added in float32, where its gradient is exact, and faster than inside the convolution.
+        logits = functional.conv_transpose2d(self.convolutions(core), self.output.weight, stride=STRIDE).float()
+        assert self.output.bias is not None
+        return logits + self.output.bias.view(-1, 1, 1)
+
+
+def initialise(network: nn.Module, generator: torch.Generator) -> None:
+    """Draw every layer's weights and biases as torch does by default, U(-1/sqrt(fan in), 1/sqrt(fan in))."""
+    with torch.no_grad():
+        for layer in network.modules():
+            if isinstance(layer, nn.Linear | nn.Conv2d | nn.ConvTranspose2d):
+                bound = 1 / math.sqrt(layer.weight[0].numel())
+                layer.weight.uniform_(-bound, bound, generator=generator)
+                if layer.bias is not None:
+                    layer.bias.uniform_(-bound, bound, generator=generator)
+
+
+def _generator(seed: int, purpose: str, device: torch.device | str = "cpu") -> torch.Generator:
+    digest = hashlib.sha256(f"{seed}/{purpose}".encode()).digest()
+    return torch.Generator(device).manual_seed(int.from_bytes(digest[:7], "big"))
+
+
+class MultiHeadAutoencoder(lightning.LightningModule):
+    """An encoder and the decoder heads of a head set, with the loss that trains them (Sec. III-B).
+
+    The loss is the weighted sum over heads of the binary cross-entropy on logits, mean over a head's pixels. With
+    `beta` > 0 comes beta times the Kullback-Leibler divergence of z from N(0, 1), divided by the image's 12,288
+    numbers, so that beta = 1 is the evidence lower bound of `rec`. Losses are averaged over each epoch and split in
+    `means`, on the device: Lightning's own logging would wait for the device at every step.
+    Raises BadInputError for an unknown head set.
+    """
+
+    def __init__(self, heads: str, settings: EncoderSettings, encoder_seed: int) -> None:
+        super().__init__()
+        if heads not in HEAD_SETS:
+            raise one_of("head set", heads, HEAD_SETS)
+        self.settings = settings
+        self.encoder = Encoder(variational=settings.beta > 0)
+        self.decoders = nn.ModuleDict({head: Decoder(HEADS[head]) for head in HEAD_SETS[heads]})
+        initialise(self.encoder, _generator(encoder_seed, "encoder"))
+        for head, decoder in self.decoders.items():
+            initialise(decoder, _generator(encoder_seed, f"decoder {head}"))
+        self.metrics = ("loss", *(f"loss_{head}" for head in self.decoders), *(["loss_kl"] if settings.beta else []))
+        self.noise_seed = encoder_seed
+        self.noise: torch.Generator | None = None
+        self.noise_state: Tensor | None = None  # to start from, when a training goes on
+        self.reset_means()
+
+    def forward(self, images: Tensor) -> dict[str, Tensor]:
+        """Logits of each head for images [B, 3, 64, 64] float in [0, 1]."""
+        z = self.encoder(images)
+        return {head: decoder(z) for head, decoder in self.decoders.items()}
+
+    def losses(self, images: Tensor, masks: Tensor) -> Tensor:
+        """The losses named in `metrics`, of images [B, 64, 64, 3] uint8 and masks [B, 2, 512] uint8."""
+        pixels = to_float(images)
+        targets = {"rec": pixels} | unpack(masks, [head for head in self.decoders if head in MASKS])
+        features = self.encoder.features(pixels)
+        z = self.encoder.mean(features)
+        divergence = []
+        if self.encoder.log_variance is not None:
+            mean, log_variance = z.float(), self.encoder.log_variance(features).float()
+            divergence.append((mean.square() + log_variance.exp() - 1 - log_variance).sum(1).mean() / (2 * _PIXELS))
+            if self.training:  # on the test split the mean stands for z, as for the policies
+                z = mean + torch.exp(log_variance / 2) * self._noise(mean)
+        parts = [
+            functional.binary_cross_entropy_with_logits(decoder(z), targets[head])
+            for head, decoder in self.decoders.items()
+        ]
+        weights = [self.settings.head_weights.get(head, 1.0) for head in self.decoders]
+        weights += [self.settings.beta] * len(divergence)
+        parts += divergence
+        return torch.stack([sum(w * part for w, part in zip(weights, parts, strict=True)), *parts])  # type: ignore[list-item]
+
+    def _noise(self, like: Tensor) -> Tensor:
+        if self.noise is None:
+            self.noise = _generator(self.noise_seed, "noise", like.device)
+            if self.noise_state is not None:
+                self.noise.set_state(self.noise_state)
+        return torch.randn(like.shape, generator=self.noise, device=like.device)
+
+    def training_step(self, batch: tuple[Tensor, Tensor]) -> Tensor:
+        """Total loss of a batch, for the optimiser."""
+        return self._measured("train", *batch)
+
+    def validation_step(self, batch: tuple[Tensor, Tensor]) -> None:
+        """Losses of a batch of the test split."""
+        self._measured("test", *batch)
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        """Adam (Sec. IV-B)."""
+        return torch.optim.Adam(self.parameters(), lr=self.settings.lr, fused=True)
+
+    def _measured(self, split: Split, images: Tensor, masks: Tensor) -> Tensor:
+        losses = self.losses(images, masks)
+        found = losses.detach()
+        weighted = torch.cat([found, found.new_ones(1)]).double() * len(images)
+        self.sums[split] = self.sums[split].to(found.device, non_blocking=True) + weighted
+        self.totals[split].append(found[0])
+        return losses[0]
+
+    def reset_means(self) -> None:
+        """Forget the losses seen."""
+        self.sums = {name: torch.zeros(len(self.metrics) + 1, dtype=torch.float64) for name in ("train", "test")}
+        self.totals: dict[str, list[Tensor]] = {"train": [], "test": []}
+
+    def means(self) -> dict[str, float]:
+        """Mean of each loss over the frames seen since the last reset, e.g. "train/loss_rec"."""
+        found: dict[str, float] = {}
+        for split, sums in self.sums.items():
+            *values, count = sums.tolist()
+            found |= {f"{split}/{name}": value / count for name, value in zip(self.metrics, values, strict=True)}
+        return found
+
+    def not_finite(self, split: Split) -> int | None:
+        """Position of the first batch since the last call whose loss was not a finite number."""
+        totals, self.totals[split] = self.totals[split], []
+        if not totals:
+            return None
+        bad = ~torch.stack(totals).isfinite()
+        return int(bad.int().argmax()) if bool(bad.any()) else None
+
+
+def to_float(images: Tensor) -> Tensor:
+    """Images [B, 64, 64, 3] uint8 as [B, 3, 64, 64] float32 in [0, 1], channels last in memory."""
+    return images.permute(0, 3, 1, 2).float().div_(255)
+
+
+def unpack(masks: Tensor, heads: Sequence[str]) -> dict[str, Tensor]:
+    """Packed masks [B, 2, 512] uint8 as one [B, 1, 64, 64] float32 of 0 and 1 for each head; first bit highest."""
+    shifts = torch.arange(7, -1, -1, dtype=torch.uint8, device=masks.device)
+    unpacked = {}
+    for head in heads:
+        bits = (masks[:, MASKS.index(head), :, None] >> shifts) & 1
+        unpacked[head] = bits.view(-1, 1, IMAGE, IMAGE).float()
+    return unpacked
+
+
+# --- batches --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Batches:
+    """Slices of the frame arrays, one tuple (images, masks) for each part of the order."""
+
+    images: Bytes | Tensor
+    masks: Bytes | Tensor
+    parts: Sequence[Indices]
+
+    def __len__(self) -> int:
+        return len(self.parts)
+
+    def __iter__(self) -> Iterator[tuple[Tensor, Tensor]]:
+        if isinstance(self.images, Tensor) and isinstance(self.masks, Tensor):
+            device = self.images.device
+            for rows in [torch.from_numpy(part).to(device) for part in self.parts]:
+                yield self.images[rows], self.masks[rows]
+        else:
+            for part in self.parts:
+                yield torch.from_numpy(self.images[part]), torch.from_numpy(self.masks[part])
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """Which frames train when. An epoch is one pass over the subset.
+
+    With the budget `steps` it is instead as many frames as one pass over the whole training split: the passes over
+    the subset follow one another and are cut at that number, so steps and points of the curve are those of fraction 1.
+    Batches are as even as can be, at most `batch` frames: a last one of a few would upset BatchNorm's statistics.
+    """
+
+    subset: Indices
+    test: Indices
+    frames_an_epoch: int
+    batch: int
+    epochs: int
+    seed: int
+
+    @property
+    def steps(self) -> int:
+        """Optimiser steps an epoch."""
+        return math.ceil(self.frames_an_epoch / self.batch)
+
+    def parts(self, epoch: int) -> list[Indices]:
+        """Rows of each batch of an epoch, counted from 0."""
+        passes = math.ceil(self.frames_an_epoch / len(self.subset))
+        orders = [epoch_order(self.subset, self.seed, epoch * passes + number) for number in range(passes)]
+        return np.array_split(np.concatenate(orders)[: self.frames_an_epoch], self.steps)
+
+
+def plan_training(
+    frames: Frames, fraction: float, encoder_seed: int, settings: EncoderSettings, frames_settings: FramesSettings
+) -> _Plan:
+    """Which frames train when. Raises BadInputError when the batch is larger than the data."""
+    subset = frames.subset(fraction, frames_settings.unit, frames_settings.seed)
+    if settings.batch > len(subset):
+        raise BadInputError(
+            f"batch {settings.batch} is larger than the {len(subset)} training frames at fraction {fraction:g}; "
+            "lower --encoder.batch or raise --frames.encoder"
+        )
+    whole = len(frames.indices("train")) if settings.budget == "steps" else len(subset)
+    return _Plan(subset, frames.indices("test"), whole, settings.batch, settings.epochs, encoder_seed)
+
+
+# --- devices --------------------------------------------------------------------------------------------------------
+
+
+def check_device(name: str) -> torch.device:
+    """The torch device of that name. Raises BadInputError when this machine lacks it."""
+    try:
+        device = torch.device(name)
+    except RuntimeError as error:
+        raise one_of("device", name, ("cpu", "cuda", "cuda:0", "...")) from error
+    if device.type == "cpu":
+        return torch.device("cpu")
+    count = torch.cuda.device_count()
+    if device.type != "cuda" or (device.index or 0) >= count:
+        names = ["cpu", *(f"cuda:{index}" for index in range(count))]
+        raise BadInputError(f"device '{name}' is not on this machine; choose from {', '.join(names)}")
+    return torch.device("cuda", device.index or 0)
+
+
+def choose_precision(setting: Literal["auto", "fp32", "bf16"], device: torch.device) -> Literal["fp32", "bf16"]:
+    """The precision of the networks in training; "auto" is bf16 where the hardware multiplies bf16 matrices itself."""
+    if setting != "auto":
+        return setting
+    if device.type == "cuda":
+        native = torch.cuda.get_device_capability(device) >= (8, 0)
+    else:
+        native = "amx_bf16" in _cpu_flags() or "avx512_bf16" in _cpu_flags()
+    return "bf16" if native else "fp32"
+
+
+def _cpu_flags() -> set[str]:
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text(encoding="ascii", errors="ignore").splitlines():
+            if line.startswith("flags"):
+                return set(line.split())
+    return set()
+
+
+# --- checkpoints ----------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class _State:
+    """How far a training has come: whole epochs, steps of the next, seconds spent, and the curves so far."""
+
+    epoch: int = 0
+    step: int = 0
+    seconds: float = 0.0
+    rows: list[tuple[str, int, str, float]] = field(default_factory=list)
+
+
+def _write_checkpoint(path: Path, content: dict[str, Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as draft:
+        try:
+            torch.save(content, draft)
+            draft.flush()
+            os.fsync(draft.fileno())
+            Path(draft.name).replace(path)
+        except BaseException:
+            Path(draft.name).unlink(missing_ok=True)
+            raise
+
+
+def _read_checkpoint(path: Path, training: dict[str, Any]) -> dict[str, Any]:
+    """What `_write_checkpoint` wrote. Raises BadInputError when it is broken, or of another training."""
+    try:
+        content: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+        other = content["training"]
+    except (OSError, RuntimeError, EOFError, KeyError, TypeError, ValueError, pickle.UnpicklingError) as error:
+        raise BadInputError(f"{path} is no checkpoint of an encoder ({error}); delete it to train anew") from error
+    for name in sorted(training | other):
+        if training.get(name) != other.get(name):
+            raise BadInputError(
+                f"checkpoint {path} is of another configuration: {name} is {other.get(name)!r} there and "
+                f"{training.get(name)!r} here; delete it to train anew, or name another file"
+            )
+    return content
+
+
+# --- training -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class TrainedEncoder:
+    """A trained encoder and what its training left behind.
+
+    `weights`: the encoder's by name, float32. `curves`: columns split, epoch, metric, value; metrics loss, loss_rec,
+    loss_pred, loss_plan, loss_kl as far as they apply. `samples`: see `CellResult.samples`. `frames`: distinct training
+    frames. `seconds` in training, over all processes that took part. `precision`: "fp32" or "bf16".
+    """
+
+    weights: Arrays
+    curves: pd.DataFrame
+    samples: Arrays
+    frames: int
+    seconds: float
+    precision: str
+
+
+def train_encoder(
+    frames: Frames,
+    heads: str,
+    fraction: float,
+    encoder_seed: int,
+    settings: EncoderSettings,
+    frames_settings: FramesSettings,
+    *,
+    device: str,
+    checkpoint: Path | None,
+    log: Log,
+    progress: Progress | None = None,
+) -> TrainedEncoder:
+    """Train an encoder with a head set on a fraction of the training frames (Sec. IV-B, V-B).
+
+    `log(epoch, losses)` is called after each epoch, counted from 1, with losses such as "test/loss_rec"; after a resume
+    first for the epochs that were done before. `progress(steps done, steps in all)` comes a few times a second.
+    `checkpoint` is the file that a killed training goes on from; it stays when the training is done.
+    Raises BadInputError for a head set, device, batch or checkpoint that cannot be used, and TrainingDivergedError,
+    naming epoch and step, for a loss that is not finite.
+    """
+    target = check_device(device)
+    precision = choose_precision(settings.precision, target)
+    plan = plan_training(frames, fraction, encoder_seed, settings, frames_settings)
+    module = MultiHeadAutoencoder(heads, settings, encoder_seed)
+    training = {
+        "heads": heads,
+        "fraction": fraction,
+        "encoder_seed": encoder_seed,
+        "frames": _fingerprint(frames, plan),
+        "precision": precision,
+        "device": target.type,
+        **settings.model_dump(mode="json", exclude={"precision"}),
+    }
+    course = _Course(module, plan, training, checkpoint, log, progress)
+    course.resume()
+    if course.state.epoch < plan.epochs:
+        _fit(module, _Data(frames, plan, course.state, target), course, target, precision)
+        course.save()
+    encoder = {name: value.numpy(force=True).copy() for name, value in module.encoder.state_dict().items()}
+    return TrainedEncoder(
+        weights=encoder,
+        curves=pd.DataFrame(course.state.rows, columns=["split", "epoch", "metric", "value"]),
+        samples=paint_samples(module, frames, choose_samples(frames)),
+        frames=len(plan.subset),
+        seconds=course.state.seconds,
+        precision=precision,
+    )
+
+
+class _Data(lightning.LightningDataModule):
+    """The batches of the epoch that a training is in, from its step on."""
+
+    def __init__(self, frames: Frames, plan: _Plan, state: _State, device: torch.device) -> None:
+        super().__init__()
+        self.plan, self.state = plan, state
+        self.images, self.masks = resident(frames, device)
+
+    def train_dataloader(self) -> _Batches:
+        return _Batches(self.images, self.masks, self.plan.parts(self.state.epoch)[self.state.step :])
+
+    def val_dataloader(self) -> _Batches:
+        test = self.plan.test
+        return _Batches(self.images, self.masks, np.array_split(test, math.ceil(len(test) / self.plan.batch)))
+
+
+def resident(frames: Frames, device: torch.device) -> tuple[Bytes | Tensor, Bytes | Tensor]:
+    """Images and masks on a GPU where they fit, else as they are: memory-mapped."""
+    if device.type == "cpu":
+        return frames.images, frames.masks
+    free, _ = torch.cuda.mem_get_info(device)
+    if frames.images.nbytes + frames.masks.nbytes > RESIDENT_SHARE * free:
+        return frames.images, frames.masks
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="The given NumPy array is not writable")
+        return torch.from_numpy(frames.images).to(device), torch.from_numpy(frames.masks).to(device)
+
+
+class _Course(lightning.Callback):
+    """Follows a training: counts, logs each epoch, keeps the checkpoint, and stops at a loss that is not finite."""
+
+    def __init__(
+        self,
+        module: MultiHeadAutoencoder,
+        plan: _Plan,
+        training: dict[str, Any],
+        checkpoint: Path | None,
+        log: Log,
+        progress: Progress | None,
+    ) -> None:
+        self.module, self.plan, self.training, self.checkpoint = module, plan, training, checkpoint
+        self.report, self.progress = log, progress  # `log` is taken by Lightning
+        self.state = _State()
+        self.optimizer: torch.optim.Optimizer | None = None
+        self.optimizer_state: dict[str, Any] | None = None
+        self.checked = 0  # step of this epoch up to which losses are known to be finite
+        self.started = self.saved = self.shown = time.monotonic()
+        self.sigterm = signal.getsignal(signal.SIGTERM)
+
+    def resume(self) -> None:
+        """Take up the checkpoint, when there is one."""
+        if self.checkpoint is None or not self.checkpoint.exists():
+            return
+        content = _read_checkpoint(self.checkpoint, self.training)
+        self.module.load_state_dict(content["network"])
+        self.module.sums["train"] = content["sums"]
+        self.module.noise_state = content["noise"]
+        self.optimizer_state = content["optimizer"]
+        rows = [(str(split), int(epoch), str(metric), float(value)) for split, epoch, metric, value in content["rows"]]
+        self.state = _State(content["epoch"], content["step"], content["seconds"], rows)
+        self.checked = self.state.step
+        for epoch, lines in itertools.groupby(rows, key=lambda row: row[1]):
+            self.report(epoch, {f"{split}/{metric}": value for split, _, metric, value in lines})
+
+    def save(self) -> None:
+        """Write the checkpoint, unless a loss was not finite: then there is nothing worth going on from."""
+        now = time.monotonic()
+        self.state.seconds += now - self.started
+        self.started = self.saved = now
+        self._check("train")
+        if self.checkpoint is None:
+            return
+        assert self.optimizer is not None
+        content = {
+            "training": self.training,
+            "epoch": self.state.epoch,
+            "step": self.state.step,
+            "seconds": self.state.seconds,
+            "rows": [list(row) for row in self.state.rows],
+            "network": self.module.state_dict(),
+            "sums": self.module.sums["train"].cpu(),
+            "optimizer": self.optimizer.state_dict(),
+            "noise": None if self.module.noise is None else self.module.noise.get_state(),
+        }
+        _write_checkpoint(self.checkpoint, content)
+
+    def on_train_start(self, trainer: lightning.Trainer, *_: object) -> None:
+        self.started = self.saved = time.monotonic()
+        (self.optimizer,) = trainer.optimizers
+        if self.optimizer_state is not None:
+            self.optimizer.load_state_dict(self.optimizer_state)
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, self.sigterm)  # Lightning would wait for the epoch's end, and exit with 0
+
+    def on_train_batch_end(self, *_: object) -> None:
+        self.state.step += 1
+        now = time.monotonic()
+        steps = self.plan.steps
+        done, total = self.state.epoch * steps + self.state.step, self.plan.epochs * steps
+        if self.progress is not None and (now - self.shown >= PROGRESS_SECONDS or done == total):
+            self.progress(done, total)
+            self.shown = now
+        if now - self.saved >= CHECKPOINT_SECONDS and self.state.step < steps:
+            self.save()
+
+    def on_train_epoch_end(self, *_: object) -> None:
+        self._check("train")
+        self._check("test")
+        losses = self.module.means()
+        self.module.reset_means()
+        self.state.epoch, self.state.step, self.checked = self.state.epoch + 1, 0, 0
+        for name, value in losses.items():
+            split, metric = name.split("/")
+            self.state.rows.append((split, self.state.epoch, metric, value))
+        self.report(self.state.epoch, losses)
+        if time.monotonic() - self.saved >= CHECKPOINT_SECONDS and self.state.epoch < self.plan.epochs:
+            self.save()
+
+    def _check(self, split: Split) -> None:
+        bad = self.module.not_finite(split)
+        if bad is not None:
+            where = f"step {self.checked + bad + 1}" if split == "train" else "its test split"
+            raise TrainingDivergedError(
+                f"the loss is not a finite number in epoch {self.state.epoch + 1}, {where}; lower --encoder.lr"
+            )
+        if split == "train":
+            self.checked = self.state.step
+
+
+def _fit(module: MultiHeadAutoencoder, data: _Data, course: _Course, device: torch.device, precision: str) -> None:
+    if device.type == "cpu":
+        _keep_memory()
+    with _quiet():
+        trainer = lightning.Trainer(
+            accelerator="gpu" if device.type == "cuda" else "cpu",
+            devices=1 if device.index is None else [device.index],
+            precision="bf16-mixed" if precision == "bf16" else "32-true",
+            max_epochs=data.plan.epochs - data.state.epoch,
+            callbacks=[course],
+            plugins=[LightningEnvironment()],  # one process, also inside a Slurm job
+            logger=False,
+            enable_checkpointing=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            num_sanity_val_steps=0,
+            reload_dataloaders_every_n_epochs=1,
+        )
+        try:
+            trainer.fit(module, datamodule=data)
+        except SystemExit as error:
+            if isinstance(error.__context__, KeyboardInterrupt):  # Lightning makes Ctrl-C an exit with code 1
+                raise KeyboardInterrupt from None
+            raise
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Lightning says nothing about devices, workers and its own products."""
+    logger = logging.getLogger("lightning.pytorch")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", module="lightning.*")
+            yield
+    finally:
+        logger.setLevel(level)
+
+
+def _keep_memory() -> None:
+    """Let glibc keep freed blocks: giving each large one back costs half the speed at batch 2048 (page faults)."""
+    with contextlib.suppress(OSError, AttributeError):
+        libc = ctypes.CDLL(None)
+        mmap_max, trim_threshold = -4, -1  # names in malloc.h
+        libc.mallopt(mmap_max, 0)
+        libc.mallopt(trim_threshold, 2**31 - 1)
+
+
+def _fingerprint(frames: Frames, plan: _Plan) -> str:
+    digest = hashlib.sha256()
+    for array in (plan.subset, plan.test, frames.images[plan.subset[:8]], frames.masks[plan.subset[:8]]):
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()[:16]
+
+
+# --- what is kept of a trained encoder ------------------------------------------------------------------------------
+
+
+def choose_samples(frames: Frames) -> Indices:
+    """Rows of up to 16 test frames to show, the same for every encoder: those with most to see, drive by drive.
+
+    A frame's content is the mean of two ranks among the test frames: set pixels in its pred and in its plan mask.
+    """
+    test = frames.indices("test")
+    pixels = np.bitwise_count(frames.masks[test]).sum(axis=2, dtype=np.int64)
+    content = pd.DataFrame(pixels).rank().sum(axis=1)
+    table = pd.DataFrame({"row": test, "drive": frames.labels["episode"].to_numpy()[test], "content": content})
+    table = table.sort_values(["content", "row"], ascending=[False, True])
+    table["turn"] = table.groupby("drive").cumcount()
+    chosen = table.sort_values("turn", kind="stable")["row"].head(SAMPLES)
+    return np.sort(chosen.to_numpy(np.int64))
+
+
+def paint_samples(module: MultiHeadAutoencoder, frames: Frames, rows: Indices) -> Arrays:
+    """Inputs, each head's outputs and targets of some frames, uint8, as `CellResult.samples` documents."""
+    images, masks = torch.from_numpy(frames.images[rows]), torch.from_numpy(frames.masks[rows])
+    module.eval()
+    with torch.inference_mode():
+        outputs = {head: logits.sigmoid() for head, logits in module(to_float(images)).items()}
+    samples = {"input": images.numpy()}
+    for head, output in outputs.items():
+        painted = output.mul(255).round().to(torch.uint8).permute(0, 2, 3, 1)
+        samples[f"{head}_output"] = painted.squeeze(-1).contiguous().numpy()
+    for head, target in unpack(masks, [head for head in outputs if head in MASKS]).items():
+        samples[f"{head}_target"] = target.mul(255).to(torch.uint8).squeeze(1).numpy()
+    return samples
+
+
+def encode(
+    weights: Mapping[str, NDArray[Any]], images: Bytes, indices: Indices, *, device: str = "cpu", batch: int = 256
+) -> NDArray[np.float32]:
+    """Latents z [N, 64] float32 of some rows of `images` [.., 64, 64, 3] uint8; the mean when variational.
+
+    Always computed in float32, so that z depends on the precision of training only through the weights.
+    Raises BadInputError when the weights are not an Encoder's, or the device is not there.
+    """
+    target = check_device(device)
+    encoder = Encoder(variational="log_variance.weight" in weights)
+    try:
+        encoder.load_state_dict({name: torch.from_numpy(np.array(value)) for name, value in weights.items()})
+    except (RuntimeError, TypeError) as error:
+        raise BadInputError(f"these are not the weights of an encoder: {error}") from error
+    encoder = encoder.eval().to(target)
+    z = np.empty((len(indices), LATENT), np.float32)
+    with torch.inference_mode():
+        for start in range(0, len(indices), batch):
+            part = torch.from_numpy(images[indices[start : start + batch]]).to(target)
+            z[start : start + batch] = encoder(to_float(part)).float().numpy(force=True)
+    return z
