@@ -35,51 +35,30 @@ from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from study.birdview import MASK_BYTES, RATE_HZ, Renderer, governing_light, valid_moments
+from study.birdview import MASK_BYTES, Renderer
 from study.config import (
-    ACCELERATIONS,
     FORMAT_VERSIONS,
     IMAGE,
-    STEERING_CROP,
     BadInputError,
     BirdviewSettings,
     FramesSettings,
     content_key,
 )
 from study.episode import episode_digest, file_digest, read_episode
+from study.selection import LABELS, SETS, Columns, Indices, candidates, choose, histograms
 
 SCHEMA_VERSION = 1
-SETS = ("encoder", "policy")
 SHAPES = {"images": (IMAGE, IMAGE, 3), "masks": (2, MASK_BYTES)}
-STEERING_EDGES = (-0.15, -0.05, -0.01, 0.01, 0.05, 0.15)  # of the bins that the policy set is raked to (PROTOTYPE.md)
-STANDING = 0.1  # [m/s], below it a vehicle stands
+# A disk that is full, a folder that cannot be: the user can change that, anything else is a fault.
+WRITE_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS, errno.ENOTDIR, errno.EEXIST)
 CHUNK = 512  # frames painted before they are written: 7 MB
 
-LABELS = pa.schema(
-    [
-        ("episode", pa.int32()),  # position in the manifest's list of the set's drives
-        ("agent", pa.int32()),  # the vehicle's id in its Episode
-        ("step", pa.int32()),
-        ("train", pa.bool_()),
-        ("steering", pa.float32()),
-        ("acceleration", pa.int8()),  # class, an index into ACCELERATIONS
-        ("speed", pa.float32()),  # [m/s]
-        ("light", pa.uint8()),  # of the governing light in range: 0 none or green, 1 yellow, 2 red
-        ("light_distance", pa.float32()),  # [m], NaN where there is none
-        ("lead_gap", pa.float32()),  # [m], NaN where the way is free
-        ("standing", pa.bool_()),
-    ]
-)
-
-# What a random generator is for; with the settings' seed it makes the generator.
-_PHASE, _SPLIT, _CHOICE, _SUBSET, _ORDER = range(5)
+# What a random generator is for; with a seed it makes the generator. `selection` has others.
+_SUBSET, _ORDER = 2, 3
 
 Progress = Callable[[str, int, int], None]
-Indices = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
 
 
@@ -186,9 +165,9 @@ def _open_set(folder: Path, entry: dict[str, Any], *, check: bool) -> Frames:
         if file_digest(path) != entry["labels"]:
             raise BadInputError(f"{path} does not match its digest in the manifest; {remedy}")
         labels = pd.read_parquet(path)
-    except (OSError, ValueError, pa.ArrowException) as error:
+    except (OSError, ValueError) as error:
         raise BadInputError(f"{path} holds no labels ({error}); {remedy}") from error
-    if len(labels) != entry["frames"] or list(labels.columns) != LABELS.names:
+    if len(labels) != entry["frames"] or list(labels.columns) != list(LABELS):
         raise BadInputError(f"{path} has {len(labels)} rows of {', '.join(labels.columns)}; {remedy}")
     for part in entry["parts"] if check else ():
         rows = slice(part["start"], part["start"] + part["rows"])
@@ -238,7 +217,7 @@ def build_frames(
                 with _pool(processes) as pool:
                     build.run(pool, progress or (lambda *_: None))
     except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS, errno.ENOTDIR):
+        if error.errno not in WRITE_ERRORS:
             raise
         raise BadInputError(
             f"cannot write {folder}: {error.strerror}; make room or name another folder, then give the same command "
@@ -352,7 +331,7 @@ class _Build:
             "schema_version": SCHEMA_VERSION,
             "key": self.given_key or self.inputs,
             "inputs": self.inputs,
-            "digest": content_key("store", [parts[name] for name in SETS], (), SCHEMA_VERSION),
+            "digest": content_key("store", [[plan[name]["columns"], parts[name]] for name in SETS], (), SCHEMA_VERSION),
             "settings": {
                 "frames": self.frames.model_dump(mode="json", exclude={"unit"}),
                 "birdview": self.birdview.model_dump(mode="json"),
@@ -380,7 +359,10 @@ class _Build:
         path = self.draft / "plan.json"
         if path.is_file():
             plan: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-            if plan["inputs"] == self.inputs:
+            labels = {name: self.draft / name / "labels.parquet" for name in SETS}
+            if plan["inputs"] == self.inputs and all(
+                file_digest(labels[name]) == plan[name]["labels"] for name in SETS
+            ):
                 return plan
         if self.draft.exists():
             shutil.rmtree(self.draft)
@@ -390,31 +372,31 @@ class _Build:
             for name in SETS
             for number, path in enumerate(self.paths[name])
         ]
-        tables: list[dict[str, NDArray[Any]]] = [{}] * len(tasks)
-        for done, (number, table) in enumerate(_results(pool, _candidates, tasks)):
+        tables: list[Columns] = [{}] * len(tasks)
+        for done, (number, table) in enumerate(_results(pool, candidates, tasks)):
             tables[number] = table
             progress("select", done + 1, len(tasks))
         plan = {"inputs": self.inputs}
         first = 0
         for name, wanted in (("encoder", self.frames.encoder), ("policy", self.frames.policy)):
             last = first + len(self.paths[name])
-            columns = {key: np.concatenate([table[key] for table in tables[first:last]]) for key in LABELS.names}
+            columns = {key: np.concatenate([table[key] for table in tables[first:last]]) for key in LABELS}
             first = last
-            rows, train, test_drives = _choose(columns, name, wanted, len(self.paths[name]), self.frames)
-            before = _balance(columns, np.ones(len(columns["step"]), bool))
+            rows, train, test_drives = choose(columns, name, wanted, len(self.paths[name]), self.frames)
+            before = histograms(columns, np.ones(len(columns["step"]), bool))
             chosen = {key: values[rows] for key, values in columns.items()} | {"train": train}
             (self.draft / name).mkdir(parents=True)
-            table = pa.table({key: pa.array(chosen[key]) for key in LABELS.names}, schema=LABELS)
-            pq.write_table(table, self.draft / name / "labels.parquet", compression="zstd")
+            pd.DataFrame(chosen).to_parquet(self.draft / name / "labels.parquet", index=False)
             plan[name] = {
                 "frames": len(rows),
                 "train": int(train.sum()),
                 "test": int((~train).sum()),
                 "test_drives": test_drives,
                 "labels": file_digest(self.draft / name / "labels.parquet"),
+                "columns": hashlib.sha256(b"".join(chosen[key].tobytes() for key in LABELS)).hexdigest(),
                 "candidates": before,
-                "chosen": {"all": _balance(chosen, np.ones(len(rows), bool))}
-                | {split: _balance(chosen, train == (split == "train")) for split in ("train", "test")},
+                "chosen": {"all": histograms(chosen, np.ones(len(rows), bool))}
+                | {split: histograms(chosen, train == (split == "train")) for split in ("train", "test")},
             }
         _write_json(path, plan)
         return plan
@@ -438,6 +420,7 @@ class _Build:
                 size = _header(whole) + int(np.prod(whole))
                 if path.is_file() and path.stat().st_size == size:
                     continue
+                (self.draft / "journal").unlink(missing_ok=True)
                 np.lib.format.open_memmap(path, mode="w+", dtype=np.uint8, shape=whole)
                 with path.open("r+b") as stream:
                     os.posix_fallocate(stream.fileno(), 0, size)
@@ -450,8 +433,8 @@ class _Build:
             parts[line["set"]][line["start"]] = line["part"]
         tasks: list[tuple[Any, ...]] = []
         for name in SETS:
-            labels = pq.read_table(self.draft / name / "labels.parquet", columns=["episode", "step", "agent"])
-            episode, step, agent = (labels.column(key).to_numpy() for key in ("episode", "step", "agent"))
+            labels = pd.read_parquet(self.draft / name / "labels.parquet")
+            episode, step, agent = (labels[key].to_numpy() for key in ("episode", "step", "agent"))
             starts = np.flatnonzero(np.diff(episode, prepend=-1))
             for start, end in zip(starts.tolist(), [*starts[1:].tolist(), len(episode)], strict=True):
                 if start not in parts[name]:
@@ -521,156 +504,3 @@ def _render_part(
             stream.flush()
             os.fsync(stream.fileno())  # the journal must not know of rows that a power cut takes back
     return {"start": start, "rows": len(where)} | {name: digest.hexdigest() for name, digest in digests.items()}
-
-
-# --- choosing -------------------------------------------------------------------------------------------------------
-
-
-def _candidates(
-    path: Path, number: int, name: str, frames: FramesSettings, birdview: BirdviewSettings
-) -> dict[str, NDArray[Any]]:
-    """Label columns of one drive's candidate moments; runs in a worker.
-
-    Of each vehicle every k-th moment is taken, k the spacing, from a random one on; for the encoder set a standing
-    moment is kept with probability `standing_weight`.
-    """
-    episode = read_episode(path)
-    rng = np.random.default_rng([frames.seed, _PHASE, SETS.index(name), number])
-    every = max(1, int(np.ceil(frames.spacing * RATE_HZ - 1e-9)))
-    phase = rng.integers(every, size=len(episode.agents))
-    moments = valid_moments(episode, birdview)
-    moments = moments[(moments[:, 0] - phase[moments[:, 1]]) % every == 0]
-    if name == "encoder":
-        moving = episode.speed[tuple(moments.T)] >= STANDING
-        moments = moments[moving | (rng.random(len(moments)) < frames.standing_weight)]
-    at = tuple(moments.T)
-    ids = np.array([agent.id for agent in episode.agents], np.int32)
-    return {
-        "episode": np.full(len(moments), number, np.int32),
-        "agent": ids[moments[:, 1]],
-        "step": moments[:, 0].astype(np.int32),
-        "train": np.ones(len(moments), bool),
-        "steering": episode.steering[at],
-        "acceleration": np.searchsorted(ACCELERATIONS, episode.acceleration[at]).astype(np.int8),
-        "speed": episode.speed[at],
-        "light": governing_light(episode, birdview, moments),
-        "light_distance": episode.light_distance[at],
-        "lead_gap": episode.lead_gap[at],
-        "standing": episode.speed[at] < STANDING,
-    }
-
-
-def _choose(
-    columns: dict[str, NDArray[Any]], name: str, wanted: int, drives: int, settings: FramesSettings
-) -> tuple[Indices, NDArray[np.bool_], list[int]]:
-    """Rows of the chosen candidates, sorted; which of them are for training; the test drives (Sec. V, PAPER.md 2.8)."""
-    rng = np.random.default_rng([settings.seed, _SPLIT, SETS.index(name)])
-    test = round(wanted * settings.test_share)
-    balance = settings.balance if name == "policy" else "none"
-    if settings.split == "frame":
-        rows = _sample(columns, np.arange(len(columns["step"])), wanted, balance, name, "", settings, rng)
-        train = np.ones(wanted, bool)
-        train[rng.permutation(wanted)[:test]] = False
-        return rows, train, []
-    count = min(max(1, round(drives * settings.test_share)), drives - 1)
-    test_drives = np.sort(rng.permutation(drives)[:count])
-    in_test = np.isin(columns["episode"], test_drives)
-    parts = [
-        _sample(columns, np.flatnonzero(pool), number, balance, name, f" {split}", settings, rng)
-        for pool, number, split in ((~in_test, wanted - test, "training"), (in_test, test, "test"))
-    ]
-    rows = np.sort(np.concatenate(parts))
-    return rows, ~in_test[rows], test_drives.tolist()
-
-
-def _sample(
-    columns: dict[str, NDArray[Any]],
-    pool: Indices,
-    wanted: int,
-    balance: str,
-    name: str,
-    split: str,
-    settings: FramesSettings,
-    rng: np.random.Generator,
-) -> Indices:
-    """`wanted` rows of the pool without replacement, sorted; raked to the target margins unless `balance` is none."""
-    if wanted > len(pool):
-        raise BadInputError(
-            f"the {name} set needs {wanted}{split} frames and its drives give {len(pool)}: raise "
-            f"--recording.{name}_episodes or --recording.duration, or lower --frames.{name} or --frames.spacing"
-        )
-    if balance == "none":
-        return np.sort(rng.permutation(pool)[:wanted])
-    cell, shape, margins = _cells(columns, pool, balance, settings)
-    available = np.bincount(cell, minlength=int(np.prod(shape))).reshape(shape)
-    counts = rake(available, margins, wanted, settings.weight_cap).reshape(-1)
-    order = np.lexsort((rng.random(len(pool)), cell))
-    first = np.searchsorted(cell[order], np.arange(len(counts)))
-    rank = np.arange(len(pool)) - first[cell[order]]
-    return np.sort(pool[order[rank < counts[cell[order]]]])
-
-
-def _cells(
-    columns: dict[str, NDArray[Any]], pool: Indices, balance: str, settings: FramesSettings
-) -> tuple[NDArray[np.intp], tuple[int, ...], dict[int, NDArray[np.float64]]]:
-    """Cell number of each row in (steering bin, class, standing), the cells' shape, and target shares by axis."""
-    shape = (len(STEERING_EDGES) + 1, len(ACCELERATIONS), 2)
-    bins = np.digitize(columns["steering"][pool], STEERING_EDGES)
-    cell = np.ravel_multi_index((bins, columns["acceleration"][pool], columns["standing"][pool].astype(int)), shape)
-    middle = len(STEERING_EDGES) // 2
-    steering = np.full(shape[0], (1 - settings.near_zero) / (shape[0] - 1))
-    steering[middle] = settings.near_zero
-    margins = {0: steering}
-    if balance == "all":
-        margins |= {1: np.full(3, 1 / 3), 2: np.array([1 - settings.standing, settings.standing])}
-    return cell, shape, margins
-
-
-def rake(
-    available: NDArray[np.integer[Any]], margins: dict[int, NDArray[np.float64]], wanted: int, cap: float
-) -> NDArray[np.int64]:
-    """How many to take of each cell's `available` so that `wanted` come as near to the target margins as they can.
-
-    Iterative proportional fitting, where no cell gives more than it has or more than `cap` times its proportional
-    share. `margins`: axis -> shares along it. Raises BadInputError when the cap leaves too few.
-    """
-    proportional = available * (wanted / max(int(available.sum()), 1))
-    most = np.minimum(available, np.ceil(cap * proportional))
-    if most.sum() < wanted:
-        raise BadInputError(
-            f"--frames.weight_cap {cap:g} lets {most.sum():.0f} of {wanted} frames be chosen; it must be 1 or more"
-        )
-    counts = np.minimum(proportional, most)
-    for _ in range(500):
-        for axis, shares in margins.items():
-            others = tuple(other for other in range(counts.ndim) if other != axis)
-            have = counts.sum(axis=others, keepdims=True)
-            target = wanted * np.expand_dims(shares, others)
-            counts = np.minimum(counts * (target / np.maximum(have, 1e-12)), most)
-    # Where the targets cannot be met, the rest comes from whatever is left, in proportion.
-    left = most - counts
-    if left.sum() > 0:
-        counts += left * (max(wanted - counts.sum(), 0) / left.sum())
-    whole: NDArray[np.int64] = np.floor(counts + 1e-9).astype(np.int64)
-    missing = wanted - int(whole.sum())
-    rest = np.where(whole < most, counts - whole, -1.0).reshape(-1)
-    whole.reshape(-1)[np.argsort(-rest, kind="stable")[:missing]] += 1
-    return whole
-
-
-def _balance(columns: dict[str, NDArray[Any]], rows: NDArray[np.bool_]) -> dict[str, Any]:
-    """What a reader must know of a set's labels: histograms, and the accuracy of always saying the commonest class."""
-    steering, standing = columns["steering"][rows], columns["standing"][rows]
-    classes = np.bincount(columns["acceleration"][rows], minlength=len(ACCELERATIONS))
-    number = max(int(rows.sum()), 1)
-    return {
-        "frames": int(rows.sum()),
-        "drives": len(np.unique(columns["episode"][rows])),
-        "steering_edges": list(STEERING_EDGES),
-        "steering": np.bincount(np.digitize(steering, STEERING_EDGES), minlength=len(STEERING_EDGES) + 1).tolist(),
-        "acceleration": classes.tolist(),
-        "standing": int(standing.sum()),
-        "light": np.bincount(columns["light"][rows], minlength=3).tolist(),
-        "majority_accuracy": float(classes.max() / number),
-        "steering_beyond_crop": float((np.abs(steering) > STEERING_CROP).sum() / number),
-    }

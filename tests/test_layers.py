@@ -8,6 +8,7 @@ LAYERS = [
     {"config"},
     {"episode", "result", "cost", "command", "provenance"},
     {"birdview", "sim"},
+    {"selection"},
     {"frames"},
     {"autoencoder", "policy", "stats"},
     {"cell", "claims"},
