@@ -75,7 +75,7 @@ class TownSettings(Settings):
     road_limits: tuple[Positive, ...] = Field(
         (), description="limits to draw for each road [km/h]; empty: one limit everywhere. Drawn into the map layer"
     )
-    green: Positive = Field(5.0, description="green of one approach [s]")
+    green: Positive = Field(8.0, description="green of one phase: approaches across from each other together [s]")
     yellow: Positive = Field(1.5, description="yellow [s]")
     all_red: NotNegative = Field(1.0, description="all approaches red [s]")
     brake_hold: NotNegative = Field(
