@@ -9,10 +9,12 @@ from __future__ import annotations
 import resource
 import time
 from collections.abc import Callable
+from typing import Literal
 
 import numpy as np
 import pandas as pd
 import torch
+from numpy.typing import NDArray
 
 from study.autoencoder import encode, train_encoder
 from study.config import BadInputError, cell_key, encoder_key
@@ -55,7 +57,7 @@ def run_cell(job: CellJob, log: Log, progress: Progress) -> CellResult:
     )
     trained = time.perf_counter()
 
-    train, test = (_labelled(store.policy, split) for split in ("train", "test"))
+    train, test = _labelled(store.policy, "train"), _labelled(store.policy, "test")
     z_train, z_test = (
         encode(encoder.weights, store.policy.images, indices, device=device) for indices, _ in (train, test)
     )
@@ -139,6 +141,6 @@ def device_name(device: str) -> str:
     return torch.cuda.get_device_name(device) if device.startswith("cuda") else "CPU"
 
 
-def _labelled(frames: Frames, split: str) -> tuple[np.ndarray, pd.DataFrame]:
+def _labelled(frames: Frames, split: Literal["train", "test"]) -> tuple[NDArray[np.int64], pd.DataFrame]:
     indices = frames.indices(split)
     return indices, frames.labels.iloc[indices].reset_index(drop=True)

@@ -17,7 +17,7 @@ from study.cost import clock
 
 LINE_EVERY = 15.0  # [s] between two plain lines
 STAGES = {"record": "recording drives", "render": "rendering frames", "encoder": "encoder", "policy": "policies"}
-UNITS = {"record": "drive", "render": "frame", "encoder": "epoch", "policy": "epoch"}
+UNITS = {"record": "drive", "render": "frame", "encoder": "step", "policy": "epoch"}
 ENCODER_SHARE = 0.8  # of a cell's time, where the two stages are not told apart beforehand
 DATA_KEY = ""
 

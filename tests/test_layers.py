@@ -1,6 +1,7 @@
 """Imports go one way, and every heavy dependency has one owner (README, "The tree")."""
 
 import ast
+import re
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
@@ -76,3 +77,8 @@ def test_heavy_dependencies_have_one_owner():
         if module not in OWNERS.get(name, {module})
     ]
     assert wrong == []
+
+
+def test_the_readmes_tree_is_the_tree():
+    tree = re.findall(r"^study/(\w+)(?:\.py|/) ", (ROOT / "README.md").read_text(), flags=re.MULTILINE)
+    assert sorted(tree) == sorted(modules())
