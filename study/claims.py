@@ -40,7 +40,7 @@ CLAIMS = {
     "D4": "full reaches rec-at-100 %'s final accuracy in 20 of 100 epochs at 100 %, 40 at 25 %, 60 at 6.25 %.",
 }
 Needs = Callable[["Evidence"], list[Point]]
-FOUR_SETS = ("H1", "H2", "H3", "H5")
+NEEDED = {"H1": tuple(HEAD_SETS), "H2": tuple(HEAD_SETS), "H3": ("rec+pred", "rec+plan"), "H5": tuple(HEAD_SETS)}
 REACH = {1.0: 0.2, 0.25: 0.4, 0.0625: 0.6}  # fraction -> share of the epochs that the text names (Sec. V-A, V-B)
 
 
@@ -203,7 +203,7 @@ class Evidence:
 
     def one_encoder(self, *points: Point) -> bool:
         """Whether some of these cells have one encoder only."""
-        return stats.design(self.accuracy[point] for point in points) == "A"
+        return stats.design([self.accuracy[point] for point in points]) == "A"
 
 
 def judge(record: SweepRecord) -> list[Verdict]:
@@ -231,7 +231,7 @@ def _verdict(claim: str, evidence: Evidence) -> Verdict:
 def _why_not(claim: str, needs: Needs, evidence: Evidence) -> tuple[str, tuple[str, ...]]:
     """Why a claim cannot be tested, and the cells that are not finished; empty when it can."""
     grid = evidence.grid
-    absent = sorted({"rec", "full", *(HEAD_SETS if claim in FOUR_SETS else ())} - set(grid.heads))
+    absent = [name for name in HEAD_SETS if name in NEEDED.get(claim, ("rec", "full")) and name not in grid.heads]
     if absent:
         return f"This sweep has no {' and no '.join(absent)}.", ()
     if claim.startswith("D") and len(grid.fractions) < 2:
@@ -301,7 +301,7 @@ def _same_steering(evidence: Evidence, points: Sequence[Point]) -> list[Finding]
                 "loss",
                 stats.mean_interval(values),
                 (low, high),
-                f"within ±{margin:.2g}",
+                f"within ±{1000 * margin:.2f}",
                 _state(p <= rules.alpha, low > margin or high < -margin),
                 p,
             )
@@ -372,6 +372,10 @@ def _at_top(evidence: Evidence) -> list[Point]:
     return [(heads, evidence.top) for heads in evidence.heads]
 
 
+def _two_heads(evidence: Evidence) -> list[Point]:
+    return [("rec+plan", evidence.top), ("rec+pred", evidence.top)]
+
+
 def _full_and_rec(evidence: Evidence) -> list[Point]:
     return [(heads, fraction) for fraction in evidence.grid.fractions for heads in ("full", evidence.rec[0])]
 
@@ -388,8 +392,8 @@ def _above_rule(evidence: Evidence) -> str:
     rules = evidence.rules
     return (
         "Each difference's simultaneous interval lies above 0. It fails where the interval excludes a gain of "
-        f"{rules.accuracy_margin * 100:g} points. With one encoder for each cell the interval is widened by "
-        f"{rules.encoder_allowance * 100:g} points on either side."
+        f"{rules.accuracy_margin * 100:.1f} points. With one encoder for each cell the interval is widened by "
+        f"{rules.encoder_allowance * 100:.1f} points on either side."
     )
 
 
@@ -405,7 +409,7 @@ def _reach_rule(evidence: Evidence) -> str:
     rules = evidence.rules
     return (
         f"The upper end of the epoch's interval is at most the text's epoch and {rules.reach_slack * 100:g} % of all "
-        f"epochs. With one encoder for each cell, rec must then still be {rules.encoder_allowance * 100:g} points "
+        f"epochs. With one encoder for each cell, rec must then still be {rules.encoder_allowance * 100:.1f} points "
         "below its final, so that a copy of rec with a luckier encoder would not pass."
     )
 
@@ -422,8 +426,8 @@ def _ladder(evidence: Evidence, points: Sequence[Point]) -> list[Finding]:
     return _above(evidence, [(second, first) for first, second in itertools.pairwise(points)])
 
 
-def _plan_over_pred(evidence: Evidence, _: Sequence[Point]) -> list[Finding]:
-    return _above(evidence, [(("rec+plan", evidence.top), ("rec+pred", evidence.top))])
+def _first_above_second(evidence: Evidence, points: Sequence[Point]) -> list[Finding]:
+    return _above(evidence, [(points[0], points[1])])
 
 
 def _by_fraction(evidence: Evidence, _: Sequence[Point]) -> list[Finding]:
@@ -433,7 +437,7 @@ def _by_fraction(evidence: Evidence, _: Sequence[Point]) -> list[Finding]:
 _RULES: dict[str, tuple[Needs, Callable[[Evidence], str], Callable[[Evidence, Sequence[Point]], list[Finding]]]] = {
     "H1": (_at_top, _steering_rule, _same_steering),
     "H2": (_at_top, _above_rule, _ladder),
-    "H3": (_at_top, _above_rule, _plan_over_pred),
+    "H3": (_two_heads, _above_rule, _first_above_second),
     "H4": (
         lambda evidence: [("full", evidence.top), evidence.rec],
         _reach_rule,
@@ -442,7 +446,7 @@ _RULES: dict[str, tuple[Needs, Callable[[Evidence], str], Callable[[Evidence, Se
     "H5": (_at_top, _spread_rule, _most_spread),
     "D1": (_all, _steering_rule, _same_steering),
     "D2": (_full_and_rec, _above_rule, _by_fraction),
-    "D3": (_extremes, _above_rule, lambda evidence, points: _above(evidence, [(points[0], points[1])])),
+    "D3": (_extremes, _above_rule, _first_above_second),
     "D4": (
         lambda evidence: [*_named_fractions(evidence), evidence.rec],
         _reach_rule,

@@ -112,7 +112,7 @@ def _differences(made: Numbers) -> list[Drawing]:
     if not rows or rows[0]["difference"]["low"] is None:
         return []
     allowance = made["rules"]["encoder_allowance"] if made["sweep"]["design"] == "A" else 0.0
-    zone = f" Grey zone: the ±{100 * allowance:g} points that two encoders may differ by their seeds alone." * bool(
+    zone = f" Grey zone: the ±{100 * allowance:.1f} points that two encoders may differ by their seeds alone." * bool(
         allowance
     )
     counts = sorted({row["difference"]["n"] for row in rows})
@@ -122,8 +122,8 @@ def _differences(made: Numbers) -> list[Drawing]:
             "differences",
             "Differences in final test acceleration accuracy, paired by seed, "
             f"n = {' or '.join(map(str, counts))} pairs. "
-            f"Thick bar: 95 % interval ({rows[0]['difference']['kind']}). Thin bar: t interval for all {len(rows)} "
-            f"contrasts together.{zone}",
+            f"Thick bar: 95 % interval ({rows[0]['difference']['kind']}). Thin bar: t interval for all "
+            f"{made['planned_contrasts']} planned contrasts together.{zone}",
             "Dot plot of paired differences. "
             + "; ".join(f"{row['name']}: {100 * row['difference']['value']:+.2f} points" for row in rows),
             figures.differences(

@@ -20,8 +20,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from numpy.typing import NDArray
 
-from study.config import HEAD_SETS
-
 COLOUR = {"rec": "#000000", "rec+pred": "#E69F00", "rec+plan": "#0072B2", "full": "#D55E00"}
 LINE = {"rec": "-", "rec+pred": "-.", "rec+plan": "--", "full": "-"}
 MARKER = {"rec": "o", "rec+pred": "^", "rec+plan": "s", "full": "D"}
@@ -102,7 +100,7 @@ def compare_heads(
     """
     with mpl.rc_context(STYLE):
         figure, (left, right) = _figure(2.6, columns=2)
-        for axes, bands, scale in ((left, steering, 1.0), (right, accuracy, 100.0)):
+        for axes, bands, scale in ((left, steering, 1000.0), (right, accuracy, 100.0)):
             for index, (name, rows) in enumerate(bands.groupby("heads", sort=False)):
                 _curve(axes, rows, scale, COLOUR[str(name)], LINE[str(name)], MARKER[str(name)], index)
             axes.set_xlabel("policy epoch")
@@ -110,7 +108,7 @@ def compare_heads(
         _loss_axis(left, steering, steering_floor)
         right.set_title(f"(b) Acceleration accuracy, {split}")
         _accuracy_axis(right, accuracy, accuracy_floor)
-        for axes, bands, scale in ((left, steering, 1.0), (right, accuracy, 100.0)):
+        for axes, bands, scale in ((left, steering, 1000.0), (right, accuracy, 100.0)):
             last = bands[bands["epoch"] == bands["epoch"].max()]
             ends = zip(last["mean"] * scale, last["heads"], strict=True)
             _label_ends(axes, [(float(value), str(heads), COLOUR[str(heads)]) for value, heads in ends])
@@ -170,18 +168,15 @@ def _settled(bands: pd.DataFrame) -> pd.DataFrame:
 
 def _loss_axis(axes: Axes, bands: pd.DataFrame, floor: float) -> None:
     """From 0; the best constant command's loss as a line, or in words where it is far above."""
-    high = 1.15 * float((_settled(bands)["mean"] + _settled(bands)["sd"].fillna(0)).max())
+    part, floor = _settled(bands), 1000 * floor
+    high = 1.15 * 1000 * float((part["mean"] + part["sd"].fillna(0)).max())
     axes.set_ylim(0, high)
-    axes.ticklabel_format(axis="y", style="sci", scilimits=(-2, 2), useMathText=True)
-    axes.set_ylabel("smooth L1 loss")
+    axes.set_ylabel("smooth L1 loss [$10^{-3}$]")
     if floor <= high:
         axes.axhline(floor, color=GREY, linewidth=0.6, linestyle=":")
         axes.text(axes.get_xlim()[1], floor, "best constant ", color=GREY, fontsize=6.5, ha="right", va="bottom")
     else:
-        axes.text(
-            0.98, 0.97, f"best constant: {floor:.2g}, above", transform=axes.transAxes, color=GREY, fontsize=6.5,
-            ha="right", va="top",
-        )  # fmt: skip
+        _note(axes, 0.97, f"best constant command, above: {floor:.2f}")
 
 
 def _accuracy_axis(axes: Axes, bands: pd.DataFrame, floor: float) -> None:
@@ -197,14 +192,19 @@ def _accuracy_axis(axes: Axes, bands: pd.DataFrame, floor: float) -> None:
         axes.axhline(100 * floor, color=GREY, linewidth=0.6, linestyle=":")
         axes.text(axes.get_xlim()[1], 100 * floor, "majority class ", color=GREY, fontsize=6.5, ha="right", va="bottom")
     else:
-        note = f"axis cut; majority class at {100 * floor:.1f} %"
-        axes.text(0.98, 0.03, note, transform=axes.transAxes, color=GREY, fontsize=6.5, ha="right", va="bottom")
+        _note(axes, 0.03, f"axis cut; majority class at {100 * floor:.1f} %")
+
+
+def _note(axes: Axes, height: float, text: str) -> None:
+    at = "bottom" if height < 0.5 else "top"
+    axes.text(0.98, height, text, transform=axes.transAxes, color=GREY, fontsize=6.5, ha="right", va=at)
 
 
 def _label_ends(axes: Axes, ends: Sequence[tuple[float, str, str]]) -> None:
     """Names (value, text, colour) at the right end of their curves, moved apart where they would touch."""
     low, high = axes.get_ylim()
-    gap, ordered = 0.07, sorted(ends)
+    gap = 0.14 / (axes.get_figure().get_figheight() - 0.6)  # type: ignore[union-attr]
+    ordered = sorted(ends)
     wanted = [(value - low) / (high - low) for value, _, _ in ordered]
     places = list(wanted)
     for _ in range(100):
@@ -245,7 +245,7 @@ def compare_fractions(scores: pd.DataFrame, steering_floor: float, accuracy_floo
         figure, panels = _figure(2.6, columns=2)
         titles = ("(a) Steering loss, test", "(b) Acceleration accuracy, test")
         for axes, metric, scale, title in zip(
-            panels, ("steering_loss", "acceleration_accuracy"), (1.0, 100.0), titles, strict=True
+            panels, ("steering_loss", "acceleration_accuracy"), (1000.0, 100.0), titles, strict=True
         ):
             own, ends = scores[scores["metric"] == metric], []
             for index, (name, rows) in enumerate(own.groupby("heads", sort=False)):
@@ -310,15 +310,15 @@ def differences(rows: Sequence[Mapping[str, float | str]], allowance: float) -> 
 Rows = Sequence[tuple[str, NDArray[np.uint8]]]
 
 
-def picture_rows(rows: Rows, columns: int = 8) -> Figure:
+def picture_rows(rows: Rows, columns: int = 10) -> Figure:
     """Rows of test pictures with their names (fig:single_head_rec, fig:multi_results).
 
     Each row is a name and pictures [K, 64, 64, 3] or [K, 64, 64] uint8; an empty name is a gap.
     """
     shown = [(name, pictures[:columns]) for name, pictures in rows]
     columns = max(len(pictures) for _, pictures in shown)
-    name_width, gap, space = 1.15, 0.03, 0.12
-    side = (WIDTH - name_width) / columns
+    names, space = 1.15, 0.12  # [in]
+    side = (WIDTH - names) / columns
     spaces = sum(name == "" for name, _ in shown)
     height = side * (len(shown) - spaces) + space * spaces
     figure = Figure(figsize=(WIDTH, height))
@@ -329,17 +329,19 @@ def picture_rows(rows: Rows, columns: int = 8) -> Figure:
                 top -= space
                 continue
             figure.text(0, (top - side / 2) / height, name, va="center", fontsize=7.5)
-            for column, picture in enumerate(pictures):
-                left, bottom = name_width + column * side, top - side
-                axes = figure.add_axes(
-                    (left / WIDTH, bottom / height, (side - gap) / WIDTH, (side - gap) / height), frame_on=False
-                )
-                axes.imshow(picture, cmap="gray", vmin=0, vmax=255, interpolation="nearest")
-                axes.set_axis_off()
+            strip = _strip(pictures)
+            wide = side * len(pictures)
+            axes = figure.add_axes((names / WIDTH, (top - side) / height, wide / WIDTH, side / height), frame_on=False)
+            axes.imshow(strip, interpolation="none", aspect="auto")
+            axes.set_axis_off()
             top -= side
     return figure
 
 
-def known_order(heads: Sequence[str]) -> list[str]:
-    """Head sets in the order of the study."""
-    return [name for name in HEAD_SETS if name in heads]
+def _strip(pictures: NDArray[np.uint8], larger: int = 3, gap: int = 8) -> NDArray[np.uint8]:
+    """Pictures side by side, on white: one image draws much faster than many. Enlarged, as viewers blur small ones."""
+    colour = pictures if pictures.ndim == 4 else np.repeat(pictures[..., None], 3, axis=3)
+    colour = colour.repeat(larger, axis=1).repeat(larger, axis=2)
+    framed = np.pad(colour, ((0, 0), (0, gap), (0, gap), (0, 0)), constant_values=255)
+    strip: NDArray[np.uint8] = np.concatenate(list(framed), axis=1)
+    return strip

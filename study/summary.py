@@ -47,6 +47,7 @@ def numbers(record: SweepRecord) -> Numbers:
             for metric, curves in ((stats.ACCURACY, accuracy), (stats.STEERING, steering))
             for contrast in claims.compare(record, metric, curves)
         ],
+        "planned_contrasts": len(claims.planned(grid)),
         "convergence": [
             _convergence(record, point, accuracy[point], accuracy[base]) for point in points if base in accuracy
         ],
@@ -250,7 +251,8 @@ def _cost(record: SweepRecord) -> Numbers:
         rows.append(
             {
                 "cell": cell.label,
-                **{stage: seconds.get(stage) for stage in ("encoder", "encode", "policies", "cell")},
+                **{stage: seconds.get(stage) for stage in ("encoder", "encode", "policies")},
+                "whole": seconds.get("cell"),
                 "peak_bytes": facts.get("peak_bytes"),
                 **{name: facts.get(name) for name in ("device", "precision", "threads")},
                 "frames": facts.get("frames", {}).get("encoder_train"),
@@ -258,7 +260,7 @@ def _cost(record: SweepRecord) -> Numbers:
         )
     return {
         "cells": rows,
-        "seconds": sum(row["cell"] or 0.0 for row in rows),
+        "seconds": sum(row["whole"] or 0.0 for row in rows),
         "peak_bytes": max((row["peak_bytes"] or 0 for row in rows), default=None),
     }
 

@@ -10,7 +10,7 @@ import pandas as pd
 from study.config import HEAD_SETS, Grid, StudySettings
 from study.result import CURVE_COLUMNS, NO_SEED, CellResult, SweepRecord
 
-FRAMES, EPISODES, SAMPLES = 600, 15, 8
+FRAMES, EPISODES, SAMPLES = 600, 15, 16
 
 
 @dataclass(frozen=True)
@@ -191,5 +191,46 @@ def simulate(grid=HEADS_GRID, world=None, seed=0, settings=None, unfinished=(), 
             "cpu": "A processor at 2.5 GHz",
             "cores": 2,
         },
-        data={"key": "f" * 16},
+        data=manifest(),
     )
+
+
+def manifest():
+    """What the report reads of a frame store's manifest."""
+
+    def labels(frames, drives, classes, near_zero):
+        rest = (frames - near_zero) // 6
+        return {
+            "frames": frames,
+            "drives": drives,
+            "steering_edges": [-0.15, -0.05, -0.01, 0.01, 0.05, 0.15],
+            "steering": [rest, rest, rest, near_zero, rest, rest, rest],
+            "acceleration": [round(share * frames) for share in classes],
+            "standing": frames // 10,
+            "light": [frames // 3] * 3,
+            "majority_accuracy": max(classes),
+            "steering_beyond_crop": 0.006,
+        }
+
+    def one(train, test, classes, near_zero):
+        parts = {name: labels(n, 80, classes, round(near_zero * n)) for name, n in (("train", train), ("test", test))}
+        whole = labels(train + test, 80, classes, round(near_zero * (train + test)))
+        candidates = labels(180_000, 80, (0.5, 0.1, 0.4), 120_000)
+        return {
+            "frames": train + test,
+            "train": train,
+            "test": test,
+            "test_drives": 16,
+            "candidates": candidates,
+            "chosen": {"all": whole, **parts},
+        }
+
+    return {
+        "schema_version": 1,
+        "key": "f" * 16,
+        "sources": {name: [{"name": str(i), "digest": "0"} for i in range(80)] for name in ("encoder", "policy")},
+        "sets": {
+            "encoder": one(20_000, 5000, (0.45, 0.15, 0.4), 0.6),
+            "policy": one(10_000, FRAMES, (0.34, 0.33, 0.33), 0.4),
+        },
+    }

@@ -1,0 +1,168 @@
+import json
+import re
+import subprocess
+import sys
+import zlib
+
+import pandas as pd
+import pytest
+
+from simulated import DATASIZE_GRID, HEADS_GRID, World, simulate
+from study import report
+from study.config import BadInputError, Grid
+from study.report import build_report
+
+
+def pdf_text(pdf):
+    return subprocess.run(["pdftotext", "-layout", pdf, "-"], capture_output=True, text=True, check=True).stdout
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("reports")
+    record = simulate(HEADS_GRID)
+    return record, folder, build_report(record, folder)
+
+
+def test_a_report_is_a_pdf_with_its_numbers_figures_and_table_beside_it(built):
+    record, folder, pdf = built
+    assert pdf == folder / "heads.pdf"
+    assert pdf.read_bytes().startswith(b"%PDF-")
+    own = folder / "heads"
+    assert {path.name for path in own.iterdir()} == {"report.json", "curves.parquet", "figures"}
+    pd.testing.assert_frame_equal(pd.read_parquet(own / "curves.parquet"), record.table())
+    assert {path.suffix for path in (own / "figures").iterdir()} == {".svg", ".png"}
+
+
+def test_the_same_record_gives_the_same_bytes(built, tmp_path):
+    record, folder, pdf = built
+    again = build_report(record, tmp_path)
+    assert again.read_bytes() == pdf.read_bytes()
+    assert (tmp_path / "heads" / "report.json").read_bytes() == (folder / "heads" / "report.json").read_bytes()
+
+
+def test_the_pdf_has_title_bookmarks_and_words_for_its_figures(built):
+    content = built[2].read_bytes()
+    streams = [zlib.decompress(part) for part in re.findall(rb"stream\r?\n(\x78.*?)endstream", content, re.DOTALL)]
+    assert b"/Outlines" in content or any(b"/Outlines" in stream for stream in streams)
+    whole = content + b"".join(streams)
+    assert b"/Alt" in whole
+    assert b"Effect of different heads" in content
+
+
+def test_json_holds_every_claim_and_score_and_no_word_for_infinity(built):
+    text = (built[1] / "heads" / "report.json").read_text()
+    found = json.loads(text, parse_constant=lambda word: pytest.fail(f"{word} is no JSON"))
+    assert [claim["claim"] for claim in found["claims"]] == ["H1", "H2", "H3", "H4", "H5"]
+    assert [score["heads"] for score in found["scores"]] == ["rec", "rec+pred", "rec+plan", "full"]
+    assert {score["n"] for score in found["scores"]} == {15}
+    for claim in found["claims"]:
+        for finding in claim["findings"]:
+            assert finding["estimate"]["n"] > 0
+            assert finding["estimate"]["kind"]
+
+
+def test_numbers_in_the_pdf_are_those_of_the_json(built):
+    found = json.loads((built[1] / "heads" / "report.json").read_text())
+    text = pdf_text(built[2])
+    for score in found["scores"]:
+        row = f"{100 * score['accuracy']['mean']:.1f} +{100 * score['accuracy']['sd']:.2f}"
+        assert re.search(row, text)
+    assert f"{100 * found['floor']['accuracy']:.1f} %" in text
+    for claim in found["claims"]:
+        assert claim["outcome"] in text
+
+
+def test_a_complete_report_has_no_banner_and_names_its_simulator_and_design(built):
+    text = pdf_text(built[2])
+    assert "Incomplete" not in text
+    assert "highway-env" in text.split("Summary")[0]
+    assert "nothing about other encoders" in " ".join(text.split())
+
+
+def test_unfinished_and_failed_cells_are_named_on_the_first_page(tmp_path):
+    record = simulate(HEADS_GRID, World(epochs=12), unfinished=("rec+plan 100% e0",), failed=("full 100% e0",))
+    pdf = build_report(record, tmp_path)
+    first = " ".join(pdf_text(pdf).split("\f")[0].split())
+    assert "Incomplete: 2 of 4 cells are finished" in first
+    assert "Not finished: rec+plan 100% e0" in first
+    assert re.search(r"Failed: full 100% e0 .*loss is nan", first)
+
+
+def test_a_sweep_without_any_result_still_gives_a_report(tmp_path):
+    record = simulate(HEADS_GRID, World(epochs=6), unfinished=[cell.label for cell in HEADS_GRID.cells()])
+    text = pdf_text(build_report(record, tmp_path))
+    assert "0 of 4 cells" in text
+    assert "No cell is finished" in text
+
+
+def test_a_report_of_less_removes_figures_of_more(tmp_path):
+    build_report(simulate(HEADS_GRID, World(epochs=12)), tmp_path)
+    build_report(simulate(HEADS_GRID, World(epochs=12), unfinished=("full 100% e0",)), tmp_path)
+    assert not (tmp_path / "heads" / "figures" / "multi_results.svg").exists()
+
+
+@pytest.mark.parametrize(
+    "grid",
+    [
+        Grid(name="small", title="Two cells, one seed", heads=("rec", "full"), policy_seeds=1),
+        Grid(name="only", title="No baseline", heads=("full",), fractions=(0.5,), policy_seeds=2),
+        Grid(name="encoders", title="Design B", heads=("rec", "full"), encoder_seeds=3, policy_seeds=2),
+    ],
+    ids=lambda grid: grid.name,
+)
+def test_other_grids_give_reports_too(grid, tmp_path):
+    pdf = build_report(simulate(grid, World(epochs=6)), tmp_path)
+    found = json.loads((tmp_path / grid.name / "report.json").read_text())
+    assert found["sweep"]["design"] == ("B" if grid.encoder_seeds > 1 else "A")
+    assert pdf.stat().st_size > 10_000
+
+
+def test_the_datasize_report_has_its_claims(tmp_path):
+    build_report(simulate(DATASIZE_GRID), tmp_path)
+    found = json.loads((tmp_path / "datasize" / "report.json").read_text())
+    assert [claim["claim"] for claim in found["claims"]] == ["D1", "D2", "D3", "D4"]
+    assert found["figures"][0]["name"] == "datasize_convergespeed"
+
+
+def test_publish_builds_from_the_tracker_alone_and_logs_what_it_made(tmp_path):
+    from study.tracking import Tracker
+
+    tracker = Tracker(f"sqlite:///{tmp_path}/mlflow.db")
+    record = simulate(Grid(name="heads", title="T", heads=("rec", "full"), policy_seeds=3), World(epochs=6))
+    run = tracker.open_sweep(
+        record.grid, record.profile, record.settings, record.planned, record.data, record.provenance
+    )
+    for key, result in record.results.items():
+        cell_run = tracker.start_cell(run, record.planned[key], key, record.settings, record.grid.policy_seeds)
+        tracker.commit(cell_run, result)
+    tracker.close_sweep(run, "FINISHED")
+    pdf = report.publish(tracker, "heads", None, tmp_path / "reports")
+    direct = build_report(record, tmp_path / "direct")
+    assert pdf.read_bytes() == direct.read_bytes()
+    logged = {item.path for folder in ("report", "figures") for item in tracker.client.list_artifacts(run, folder)}
+    assert {"report/heads.pdf", "report/report.json", "figures/test_compare_heads.svg"} <= logged
+
+
+def test_a_sweep_that_was_never_run_is_bad_input(tmp_path):
+    from study.tracking import Tracker
+
+    with pytest.raises(BadInputError, match="no sweep 'heads'"):
+        report.publish(Tracker(f"sqlite:///{tmp_path}/mlflow.db"), "heads", None, tmp_path)
+
+
+def test_the_command_says_what_is_wrong_and_exits_with_2(tmp_path):
+    command = [sys.executable, "-m", "study.report", "nosuch", "--tracking", f"sqlite:///{tmp_path}/m.db"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "nosuch" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_help_needs_no_heavy_library():
+    code = (
+        "import sys; from study import report; report.parser().format_help(); "
+        "print(sorted({'mlflow', 'matplotlib', 'scipy', 'typst', 'torch'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -1,0 +1,287 @@
+import itertools
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+import statsmodels.api as sm
+from scipy import stats as scipy_stats
+from statsmodels.stats.multitest import multipletests
+from statsmodels.stats.power import TTestPower
+from statsmodels.stats.weightstats import ttost_paired
+
+from simulated import DATASIZE_GRID, HEADS_GRID, World, simulate
+from study import stats
+from study.result import TABLE_COLUMNS
+
+DIFFERENCES = np.array([0.4, -0.1, 0.9, 0.3, 1.4, -0.6, 0.8, 0.2])
+
+
+@pytest.fixture(scope="module")
+def record():
+    return simulate(HEADS_GRID)
+
+
+def frame(values, encoders=1):
+    """A panel's frame of [seeds, epochs], the seeds shared out over encoders."""
+    values = np.asarray(values, float)
+    index = pd.MultiIndex.from_product(
+        [range(encoders), range(len(values) // encoders)], names=["encoder_seed", "policy_seed"]
+    )
+    return pd.DataFrame(values, index=index, columns=range(1, values.shape[1] + 1))
+
+
+# --- from the tidy table --------------------------------------------------------------------------------------------
+
+
+def test_final_scores_are_means_of_the_last_epochs_of_each_seed(record):
+    table = record.table()
+    scores = stats.final_scores(table)
+    one = table[
+        (table["heads"] == "full")
+        & (table["policy_seed"] == 3)
+        & (table["split"] == "test")
+        & (table["metric"] == stats.ACCURACY)
+        & (table["epoch"] > 95)
+    ]
+    found = scores[(scores["heads"] == "full") & (scores["policy_seed"] == 3) & (scores["metric"] == stats.ACCURACY)]
+    assert len(one) == 5
+    assert found["value"].item() == pytest.approx(one["value"].mean())
+    assert len(scores) == 4 * 15 * 4  # cells, seeds, metrics
+
+
+def test_a_panel_does_not_depend_on_the_order_of_the_rows(record):
+    table = record.table()
+    shuffled = table.sample(frac=1, random_state=1)
+    left, right = (stats.panel(rows, stats.ACCURACY) for rows in (table, shuffled))
+    assert set(left) == set(right)
+    for point, curves in left.items():
+        pd.testing.assert_frame_equal(curves, right[point])
+
+
+def test_bands_contain_the_mean_and_the_interval_is_inside_the_band(record):
+    bands = stats.curve_bands(record.table(), stats.ACCURACY)
+    assert (bands["low"] < bands["mean"]).all()
+    assert (bands["mean"] < bands["high"]).all()
+    assert (bands["high"] - bands["mean"] < bands["sd"]).all()
+    assert set(bands["n"]) == {15}
+
+
+def test_bands_of_an_empty_table_are_empty():
+    assert stats.curve_bands(pd.DataFrame(columns=list(TABLE_COLUMNS)), stats.ACCURACY).empty
+
+
+def test_one_seed_gives_a_mean_without_an_interval():
+    found = stats.mean_interval(stats.final(frame([[0.5, 0.7]]), last=1))
+    assert found.value == 0.7
+    assert math.isnan(found.low)
+    assert found.n == 1
+
+
+# --- intervals ------------------------------------------------------------------------------------------------------
+
+
+def test_t_limits_are_scipys():
+    low, high = stats.t_limits(DIFFERENCES)
+    theirs = scipy_stats.ttest_1samp(DIFFERENCES, 0).confidence_interval(0.95)
+    assert (low, high) == pytest.approx((theirs.low, theirs.high))
+
+
+def test_bca_limits_are_scipys_on_its_own_draws():
+    theirs = scipy_stats.bootstrap((DIFFERENCES,), np.mean, n_resamples=9999, method="BCa", rng=1)
+    jackknife = np.array([np.delete(DIFFERENCES, i).mean() for i in range(len(DIFFERENCES))])
+    ours = stats.bca_limits(DIFFERENCES.mean(), theirs.bootstrap_distribution, jackknife)
+    assert ours == pytest.approx(tuple(theirs.confidence_interval), abs=1e-3)
+
+
+def test_the_bootstrap_is_near_scipys_and_the_same_each_time():
+    ours = stats.bootstrap(DIFFERENCES)
+    theirs = scipy_stats.bootstrap((DIFFERENCES,), np.mean, n_resamples=20_000, method="BCa", rng=2).confidence_interval
+    assert (ours.low, ours.high) == pytest.approx((theirs.low, theirs.high), abs=0.02)
+    assert ours == stats.bootstrap(DIFFERENCES)
+
+
+def test_equal_values_have_an_interval_of_no_length():
+    found = stats.bootstrap(np.full(5, 0.25))
+    assert (found.low, found.value, found.high) == (0.25, 0.25, 0.25)
+
+
+@pytest.mark.parametrize("n", [5, 15])
+def test_intervals_cover_the_truth_about_as_often_as_they_say(n):
+    rng = np.random.default_rng(3)
+    draws = 300
+    samples = rng.normal(1.0, 0.3, (draws, n))
+    t = [stats.t_limits(sample) for sample in samples]
+    assert np.mean([low <= 1 <= high for low, high in t]) == pytest.approx(0.95, abs=0.04)
+    if n == 15:  # a bootstrap of few values is too short, which is why design B uses t
+        bca = [stats.bootstrap(sample) for sample in samples]
+        assert np.mean([item.low <= 1 <= item.high for item in bca]) == pytest.approx(0.93, abs=0.04)
+
+
+def test_the_interquartile_mean_drops_a_quarter_on_either_side():
+    assert stats.interquartile_mean(np.array([-100.0, 1, 2, 3, 4, 5, 6, 900])) == pytest.approx(3.5)
+
+
+def test_several_encoders_are_the_units_of_the_interval():
+    rng = np.random.default_rng(0)
+    encoder = rng.normal(0, 1, 5).repeat(15)
+    curves = frame((encoder + rng.normal(0, 0.01, 75))[:, None], encoders=5)
+    found = stats.mean_interval(stats.final(curves))
+    naive = stats.bootstrap(stats.final(curves).to_numpy())
+    assert found.n == 5
+    assert found.high - found.low > 3 * (naive.high - naive.low)
+    both = stats.hierarchical(stats.final(curves))
+    assert both.low < found.value < both.high
+    assert both.high - both.low > 2 * (naive.high - naive.low)
+
+
+def test_variance_components_are_those_that_made_the_data():
+    rng = np.random.default_rng(1)
+    values = rng.normal(0, 0.3, (200, 1, 1)) + rng.normal(0, 0.2, (200, 5, 1)) + rng.normal(0, 0.1, (200, 5, 5))
+    found = stats.variance_components(frame(values.reshape(1000, 5), encoders=200))
+    assert found == pytest.approx({"encoder": 0.3, "policy": 0.2, "epoch": 0.1}, rel=0.12)
+    assert math.isnan(stats.variance_components(frame(values[0]))["encoder"])
+
+
+# --- comparisons ----------------------------------------------------------------------------------------------------
+
+
+def test_the_sign_flip_test_counts_all_flips():
+    signs = itertools.product((-1, 1), repeat=len(DIFFERENCES))
+    larger = [abs(np.dot(sign, DIFFERENCES)) >= abs(DIFFERENCES.sum()) - 1e-12 for sign in signs]
+    assert stats.sign_flip(DIFFERENCES) == pytest.approx(np.mean(larger))
+
+
+def test_the_sign_flip_test_is_scipys():
+    theirs = scipy_stats.permutation_test((DIFFERENCES,), np.mean, permutation_type="samples", n_resamples=np.inf)
+    assert stats.sign_flip(DIFFERENCES) == pytest.approx(theirs.pvalue)
+
+
+def test_the_smallest_p_of_n_pairs_is_two_in_two_to_the_n():
+    assert stats.sign_flip(np.arange(1, 6, dtype=float)) == 2 / 2**5
+    assert stats.sign_flip(np.zeros(5)) == 1
+
+
+def test_many_pairs_are_tested_by_random_flips_close_to_t():
+    values = np.random.default_rng(0).normal(0.3, 1, 60)
+    assert stats.sign_flip(values) == pytest.approx(scipy_stats.ttest_1samp(values, 0).pvalue, abs=0.01)
+
+
+def test_holm_is_statsmodels():
+    p_values = [0.01, 0.04, 0.03, 0.005, 0.9]
+    assert stats.holm(p_values) == pytest.approx(multipletests(p_values, method="holm")[1])
+
+
+def test_probability_of_improvement_is_mann_whitneys():
+    first, second = np.array([1.0, 2, 2, 5]), np.array([0.0, 2, 3])
+    u = scipy_stats.mannwhitneyu(first, second).statistic
+    assert stats.improvement(first, second) == pytest.approx(u / 12)
+
+
+def test_the_detectable_difference_is_statsmodels():
+    effect = TTestPower().solve_power(nobs=len(DIFFERENCES), alpha=0.05, power=0.8)
+    assert stats.detectable(DIFFERENCES) == pytest.approx(effect * DIFFERENCES.std(ddof=1), rel=1e-4)
+
+
+@pytest.mark.parametrize("margin", [0.5, 1.0, 2.0])
+def test_equivalence_is_statsmodels(margin):
+    theirs = ttost_paired(DIFFERENCES, np.zeros_like(DIFFERENCES), -margin, margin)[0]
+    assert stats.equivalence(DIFFERENCES, margin) == pytest.approx(theirs)
+
+
+def test_only_seeds_that_both_have_are_paired():
+    first, second = frame([[1.0], [2.0], [3.0]])[1], frame([[1.0], [1.0]])[1]
+    assert stats.paired(first, second).tolist() == [0, 1]
+
+
+# --- convergence ----------------------------------------------------------------------------------------------------
+
+
+def test_first_reach_is_an_epoch_from_one_or_never():
+    curve = np.array([0.1, 0.5, 0.4, 0.8])
+    assert stats.first_reach(curve, 0.5) == 2
+    assert stats.first_reach(curve, 0.05) == 1
+    assert stats.first_reach(curve, 0.9) == np.inf
+
+
+def test_epochs_to_reach_follow_the_mean_curve_and_lie_in_their_interval():
+    record = simulate(HEADS_GRID)
+    curves = stats.panel(record.table(), stats.ACCURACY)
+    rec, full = curves["rec", 1.0], curves["full", 1.0]
+    found = stats.epochs_to_reach(full, rec)
+    assert full.mean()[found.value] >= stats.final(rec).mean() > full.mean()[found.value - 1]
+    assert found.low <= found.value <= found.high
+    assert found.value < stats.epochs_to_reach(rec, rec).value
+
+
+def test_a_curve_that_never_reaches_is_infinite_and_so_is_its_interval():
+    low, high = (frame(np.full((6, 10), value)) for value in (0.5, 0.6))
+    found = stats.epochs_to_reach(low, high)
+    assert (found.value, found.low, found.high) == (np.inf, np.inf, np.inf)
+
+
+def test_a_seed_has_reached_a_target_only_when_it_stays_there():
+    spike = [0, 9, 9, 0, 0, 0, 9, 9, 9, 9]
+    never = [0] * 10
+    found = stats.reach_by_seed(frame([spike, never]), target=5, window=2)
+    assert found.epochs.tolist() == [8, np.inf]
+    assert found.share == 0.5
+
+
+def test_the_median_epoch_is_kaplan_meiers():
+    epochs = np.array([4, 6, 6, 9, 12])
+    curves = frame((np.arange(1, 16) >= epochs[:, None]).astype(float))
+    censored = frame(np.vstack([curves.to_numpy(), np.zeros((2, 15))]))
+    for rows, reached in ((curves, 5), (censored, 5)):
+        found = stats.reach_by_seed(rows, target=1.0, window=1)
+        times = np.where(np.isfinite(found.epochs), found.epochs, 15)
+        theirs = sm.SurvfuncRight(times, np.isfinite(found.epochs)).quantile(0.5)
+        assert found.median == theirs
+        assert found.share == reached / len(rows)
+
+
+def test_the_variance_ratio_finds_the_noisier_curves():
+    rng = np.random.default_rng(2)
+    quiet, loud = rng.normal(0, 1, (15, 40)), rng.normal(0, 3, (15, 40))
+    found = stats.spread_ratio(frame(loud), frame(quiet), epochs=20)
+    assert found.low < 9 < found.high
+    assert found.low > 4
+    back = stats.spread_ratio(frame(quiet), frame(loud), epochs=20)
+    assert back.value == pytest.approx(1 / found.value)
+
+
+def test_the_transient_ends_when_most_of_the_rise_is_done():
+    epoch = np.arange(1, 101)
+    curves = frame(np.tile(1 - np.exp(-epoch / 10), (3, 1)))
+    assert stats.transient(curves) == pytest.approx(31, abs=1)  # exp(-30 / 10) = 0.05
+
+
+# --- predictions ----------------------------------------------------------------------------------------------------
+
+
+def test_the_best_constant_command_is_no_worse_than_any_on_a_grid():
+    labels = np.random.default_rng(0).normal(0.02, 0.1, 200)
+    others = [stats.smooth_l1(labels - constant).mean() for constant in np.linspace(-0.3, 0.3, 61)]
+    assert stats.steering_floor(labels) <= min(others) + 1e-12
+
+
+def test_recall_and_f1_of_a_known_table():
+    label = np.array([0, 0, 0, 0, 1, 1, 2, 2], np.uint8)
+    guess = np.array([[0, 0, 0, 1, 1, 1, 2, 0]], np.uint8)
+    assert np.diag(stats.confusion(guess, label)[0]).tolist() == [0.75, 1, 0.5]
+    f1 = np.mean([2 * 3 / (4 + 4), 2 * 2 / (3 + 2), 2 * 1 / (1 + 2)])
+    assert stats.macro_f1(guess, label) == pytest.approx([f1])
+
+
+def test_accuracy_by_drive_gives_every_drive_the_same_weight():
+    label = np.array([0, 0, 0, 1], np.uint8)
+    guess = np.array([[0, 0, 0, 0], [0, 0, 1, 1]], np.uint8)
+    drives = stats.episode_accuracy(guess, label, np.array([7, 7, 7, 9], np.int32))
+    assert drives.to_dict() == pytest.approx({7: 5 / 6, 9: 0.5})
+
+
+def test_data_fractions_keep_their_cells_apart():
+    record = simulate(DATASIZE_GRID, World(epochs=6))
+    assert set(stats.panel(record.table(), stats.ACCURACY)) == {
+        (heads, fraction) for heads in ("rec", "full") for fraction in DATASIZE_GRID.fractions
+    }
