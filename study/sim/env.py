@@ -13,13 +13,26 @@ from highway_env.envs.common.observation import ObservationType
 
 from study.config import ACCELERATIONS, BadInputError, TownSettings
 from study.episode import GREEN
-from study.sim.autopilot import BRAKE, DT, LENGTH, LOOK, REACH, STEERING_UNIT, THROTTLE, TOP_SPEED, Decisions, Fleet
+from study.sim.autopilot import (
+    BRAKE,
+    DT,
+    LENGTH,
+    LOOK,
+    MOST_STEERING,
+    REACH,
+    STEERING_UNIT,
+    THROTTLE,
+    TOP_SPEED,
+    Decisions,
+    Fleet,
+)
 from study.sim.lights import LightPlan, plan_lights
 from study.sim.road import TownNetwork, TownRoad, TownVehicle
 from study.sim.town import Town, draw_town
 
 EGO = 0  # position of the ego among the vehicles
 APART = 14.0  # vehicles start at least so far from each other [m]
+APART_LATER = 25.0  # and enter at least so far from others on their way, if there is such a place [m]
 START_SPEED = 5.0  # [m/s]
 OFF_ROUTE = 4.0  # an ego farther than this from its way has lost it [m]
 CURVATURES = (5.0, 10.0, 20.0)  # where the ego looks at its way [m]
@@ -37,8 +50,8 @@ class Traffic(TownRoad):
         self.steps = 0
         self.agents: list[int] = []  # of each vehicle; one that is taken away and its successor differ
         self.commands: dict[int, tuple[float, float]] = {}  # vehicle -> (acceleration, steering) for this step
-        self.collisions = 0
-        self.collided = 0  # vehicles
+        self.crashed: list[int] = []  # vehicles that collided in the last step, by now replaced
+        self.collided = 0  # vehicles since the start
         self.decisions: Decisions
         streets = [k for k, strip in enumerate(town.strips) if k in town.ways and strip.piece.length > 2 * APART]
         self.streets = np.array(streets or sorted(town.ways), np.int64)
@@ -55,6 +68,7 @@ class Traffic(TownRoad):
         """Put a new vehicle on a free spot of some street, in place of the one in `slot`, if there is one."""
         others = np.array([v.position for k, v in enumerate(self.vehicles) if k != slot]).reshape(-1, 2)
         best, most = (int(self.streets[0]), APART), -1.0
+        enough = APART_LATER if self.steps else APART
         for _ in range(200):
             strip = int(self.np_random.choice(self.streets))
             piece = self.town.strips[strip].piece
@@ -63,7 +77,7 @@ class Traffic(TownRoad):
             free = float(np.hypot(others[:, 0] - x, others[:, 1] - y).min(initial=np.inf))
             if free > most:
                 best, most = (strip, s), free
-            if free > APART:
+            if free > enough:
                 break
         strip, s = best
         x, y, heading = self.town.strips[strip].piece.at(np.array([s]))
@@ -103,13 +117,11 @@ class Traffic(TownRoad):
         """Move everybody by `dt`; whoever has crashed is taken away and a new vehicle enters elsewhere."""
         super().step(dt)
         self.steps += 1
-        crashed = [k for k, vehicle in enumerate(self.vehicles) if vehicle.crashed or vehicle.impact is not None]
-        if crashed:
-            self.collisions += 1
-            self.collided += len(crashed)
-            for slot in crashed:
-                if slot not in self.commands:
-                    self._enter(slot)
+        # highway-env crashes vehicles that will overlap after one more step in that next step: it has happened
+        self.crashed = [k for k, vehicle in enumerate(self.vehicles) if vehicle.crashed or vehicle.impact is not None]
+        self.collided += len(self.crashed)
+        for slot in self.crashed:
+            self._enter(slot)
         self._follow()
 
 
@@ -118,7 +130,8 @@ class TownAction(ActionType):
 
     def space(self) -> spaces.Space[Any]:
         """Class of acceleration, and steering (positive to the left; 0.25 is the paper's crop)."""
-        return spaces.Tuple((spaces.Discrete(len(ACCELERATIONS)), spaces.Box(-0.4, 0.4, (1,), np.float32)))
+        most = MOST_STEERING / STEERING_UNIT
+        return spaces.Tuple((spaces.Discrete(len(ACCELERATIONS)), spaces.Box(-most, most, (1,), np.float32)))
 
     @property
     def vehicle_class(self) -> type[TownVehicle]:
@@ -134,9 +147,13 @@ class TownAction(ActionType):
 class TownObservation(ObservationType):
     """What the ego's autopilot knows, as a vector."""
 
+    # speed, limit, lateral and heading error, curvatures ahead, light's distance and whether it is green, free way
+    HIGH = np.array([40, 40, 20, np.pi, *[1] * len(CURVATURES), LOOK, 1, LOOK], np.float32)
+    LOW = np.array([-1, 0, -20, -np.pi, *[-1] * len(CURVATURES), 0, 0, -LENGTH], np.float32)
+
     def space(self) -> spaces.Space[Any]:
-        """Speed, limit, lateral and heading error, curvatures ahead, light (distance, is green), free way ahead."""
-        return spaces.Box(-np.inf, np.inf, (8 + len(CURVATURES),), np.float32)
+        """In m, m/s, rad and 1/m; to the right is positive."""
+        return spaces.Box(self.LOW, self.HIGH, dtype=np.float32)
 
     def observe(self) -> np.ndarray[Any, Any]:
         """The vector after the last step."""
@@ -152,8 +169,9 @@ class TownObservation(ObservationType):
         error = (course - vehicle.heading + np.pi) % (2 * np.pi) - np.pi
         gap = min(float(road.decisions.lead_gap[EGO]), LOOK) if road.steps else LOOK
         limit = float(fleet.limits[fleet.strip[EGO]])
-        values = [vehicle.speed, limit, fleet.lateral[EGO], error, *way, distance, green, gap, float(road.steps) * DT]
-        return np.array(values, np.float32)
+        values = [vehicle.speed, limit, fleet.lateral[EGO], error, *way, distance, green, gap]
+        seen: np.ndarray[Any, Any] = np.array(values, np.float32).clip(self.LOW, self.HIGH)
+        return seen
 
 
 class TownEnv(AbstractEnv):
@@ -203,20 +221,20 @@ class TownEnv(AbstractEnv):
         self.controlled_vehicles = [self.road.vehicles[EGO]]
 
     def _simulate(self, action: Any = None) -> None:
+        self.controlled_vehicles = [self.road.vehicles[EGO]]  # a new one, if the last has collided
         self.road.commands.clear()
         super()._simulate(action)
-        self.controlled_vehicles = [self.road.vehicles[EGO]]
 
     def _reward(self, action: Any) -> SupportsFloat:
         """Speed as a share of the limit; -1 for a collision."""
         del action
-        if self.vehicle.crashed:
+        if EGO in self.road.crashed:
             return -1.0
         fleet = self.road.fleet
         return float(self.vehicle.speed / fleet.limits[fleet.strip[EGO]])
 
     def _is_terminated(self) -> bool:
-        return bool(self.vehicle.crashed or abs(self.road.fleet.lateral[EGO]) > OFF_ROUTE)
+        return bool(EGO in self.road.crashed or abs(self.road.fleet.lateral[EGO]) > OFF_ROUTE)
 
     def _is_truncated(self) -> bool:
         return bool(self.time >= self.config["duration"])

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import math
 import multiprocessing
+import os
 import shutil
+import signal
+import threading
+import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
@@ -12,15 +16,16 @@ from typing import Any
 
 import numpy as np
 
-from study.config import BadInputError, RecordingSettings, TownSettings
+from study.config import FORMAT_VERSIONS, BadInputError, RecordingSettings, TownSettings
 from study.episode import Agent, Episode, Lane, Light, empty_states, write_episode
 from study.sim.autopilot import DT, LENGTH, STEERING_UNIT, WIDTH
 from study.sim.env import TownEnv, Traffic
 from study.sim.town import LANE_WIDTH, Floats, Town
 
-FORMAT_VERSION = 1  # raised on purpose when the same settings and seed give another drive
+FORMAT_VERSION = FORMAT_VERSIONS["episodes"]  # raised when the same settings and seed give another drive
 BEYOND = 60.0  # of the planned route that is recorded behind the last position [m]
 STANDING = 0.1  # [m/s]
+STALE = 60.0  # a draft this old belongs to a call that was killed; writing takes a fraction of a second [s]
 
 
 def record_episode(town: TownSettings, recording: RecordingSettings, seed: int) -> Episode:
@@ -61,13 +66,13 @@ class Recorder:
         self.standing = np.zeros(len(road.vehicles))  # since when [s]
         self.rows: list[dict[str, Any]] = []
         self.plans: dict[int, tuple[list[int], list[float]]] = {}
-        self.start = (road.collisions, road.collided)
+        self.collided = road.collided
 
     def watch(self) -> None:
         """Take note of a step that is not recorded."""
         _, _, _, speed = self.road.pose()
         self.standing = np.where(speed < STANDING, self.standing + DT, 0)
-        self.start = (self.road.collisions, self.road.collided)
+        self.collided = self.road.collided
 
     def before(self) -> None:
         """Take the poses from which the next commands follow."""
@@ -91,8 +96,7 @@ class Recorder:
         standing = np.array([row["standing"] for row in self.rows])
         speed = np.array([row["speed"] for row in self.rows])
         return {
-            "collisions": self.road.collisions - self.start[0],
-            "collided_vehicles": self.road.collided - self.start[1],
+            "collided_vehicles": self.road.collided - self.collided,
             "standing_longer_than_cycle": round(float((standing > cycle).mean()), 6),
             "light_cycle": cycle,
             "mean_speed": round(float(speed.mean()), 4),
@@ -180,9 +184,7 @@ def record_all(
         raise BadInputError(f"processes: got {processes}; at least 1 is needed")
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / f"{seed:08d}" for seed in seeds]
-    for left in folder.glob(".*"):  # drafts of a call that was killed
-        if left.is_dir():
-            shutil.rmtree(left, ignore_errors=True)
+    _sweep(folder)
     missing = [(seed, path) for seed, path in zip(seeds, paths, strict=True) if not path.exists()]
     done = len(paths) - len(missing)
 
@@ -199,7 +201,7 @@ def record_all(
             report()
         return paths
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(processes, len(jobs)), mp_context=context) as pool:
+    with ProcessPoolExecutor(min(processes, len(jobs)), mp_context=context, initializer=_obey_parent) as pool:
         futures = [pool.submit(_record, *job) for job in jobs]
         try:
             for future in as_completed(futures):
@@ -213,4 +215,29 @@ def record_all(
 
 
 def _record(town: TownSettings, recording: RecordingSettings, seed: int, path: Path) -> None:
-    write_episode(record_episode(town, recording, seed), path)
+    episode = record_episode(town, recording, seed)
+    try:
+        write_episode(episode, path)
+    except OSError:
+        if not path.exists():  # else another call on the same folder was faster, with the same bytes
+            raise
+
+
+def _sweep(folder: Path) -> None:
+    """Remove the drafts of calls that were killed."""
+    for draft in folder.glob(".*"):
+        if draft.is_dir() and time.time() - draft.stat().st_mtime > STALE:
+            shutil.rmtree(draft, ignore_errors=True)
+
+
+def _obey_parent() -> None:
+    """In a worker: leave Ctrl-C to the parent, and end when the parent has been killed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+
+    def watch() -> None:
+        if parent is not None:
+            parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

@@ -24,6 +24,7 @@ LANE_WIDTH = 3.5  # [m]
 CORNER = 7.0  # radius of the kerb where two streets of a junction meet [m]
 BEND = (14.0, 20.0)  # from the corner of a bend to where its arc starts [m]
 SHORTEST_STREET = 16.0  # between two stop lines [m]: two waiting vehicles
+FASTEST = 50.0  # highest speed limit [km/h]
 CLEARANCE = 2.8  # centre lines nearer than this cannot be driven side by side [m]
 SAMPLE = 0.5  # spacing of points where lines are compared [m]
 
@@ -122,11 +123,13 @@ class Town:
 
 def highway_lane(strip: Strip) -> AbstractLane:
     """highway-env's lane of a strip."""
-    lines = {"none": LineType.NONE, "dashed": LineType.STRIPED}
     piece = strip.piece
+    # highway-env draws its other kind of unbroken line straight from start to end
+    unbroken = LineType.CONTINUOUS if piece.curvature else LineType.CONTINUOUS_LINE
+    lines = {"none": LineType.NONE, "dashed": LineType.STRIPED}
     options = {
         "width": LANE_WIDTH,
-        "line_types": [lines.get(border, LineType.CONTINUOUS_LINE) for border in (strip.left, strip.right)],
+        "line_types": [lines.get(border, unbroken) for border in (strip.left, strip.right)],
         "speed_limit": strip.limit,
     }
     if piece.curvature == 0:
@@ -357,6 +360,12 @@ def draw_town(settings: TownSettings, rng: np.random.Generator) -> Town:
             f"town: a block of {settings.block[0]:g} m leaves {shortest:g} m of street between its junctions; "
             f"at least {SHORTEST_STREET:g} m are needed: set block to "
             f"{settings.block[0] + SHORTEST_STREET - shortest:g} or more"
+        )
+    fastest = max((settings.speed_limit, *settings.road_limits))
+    if fastest > FASTEST:
+        raise BadInputError(
+            f"town: a limit of {fastest:g} km/h is too fast for its bends and for how far the autopilot looks; "
+            f"take at most {FASTEST:g} (speed_limit, road_limits)"
         )
     xs = np.concatenate([[0.0], np.cumsum(rng.uniform(*settings.block, columns - 1).round(1))])
     ys = np.concatenate([[0.0], np.cumsum(rng.uniform(*settings.block, rows - 1).round(1))])
