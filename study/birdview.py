@@ -10,7 +10,7 @@ that picture and paints the moving things into it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,6 +46,7 @@ _SHIFT = 8  # fractional bits of the coordinates given to cv2
 Image = NDArray[np.uint8]
 Moments = NDArray[np.int64]
 Floats = NDArray[np.float64]
+_Shape = tuple[Floats, int, float]  # points [P, 2] m, palette index, width of a line [m]; no width: a filled polygon
 
 
 def render_birdview(
@@ -292,36 +293,25 @@ def _fixed(points: Floats, affine: Floats) -> NDArray[np.int32]:
     return fixed
 
 
-@dataclass(frozen=True)
-class _Chart:
-    """What is painted of one lane: surface quads [Q, 4, 2] with a palette index, boundaries and lane lines [m]."""
-
-    shade: int
-    quads: Floats
-    boundaries: Sequence[Floats]
-    lines: Sequence[Floats]
-    low: Floats
-    high: Floats
-
-
 class _Map:
     """The painted map of an Episode: one large picture where it fits into memory, else painted window by window."""
 
     def __init__(self, lanes: Sequence[Lane], scale: float, window: int) -> None:
-        limits = {lane.speed_limit for lane in lanes}
-        self._charts = [_chart(lane, plain=len(limits) < 2) for lane in lanes]
-        self._scale, self._reach = scale, window * 2**0.5 / scale
+        self._scale, self._reach = scale, window / scale / 2**0.5 + BOUNDARY_WIDTH
+        self._shapes = _shapes(lanes)
         self._picture: Image | None = None
         self._origin = np.zeros(2)
-        if not lanes:
+        if not self._shapes:
             return
-        self._origin = np.min([chart.low for chart in self._charts], axis=0) - 1
-        extent = np.max([chart.high for chart in self._charts], axis=0) + 1 - self._origin
-        columns, rows = np.ceil(extent * scale).astype(int).tolist()
+        points = np.concatenate([shape for shape, _, _ in self._shapes])
+        starts = np.cumsum([0] + [len(shape) for shape, _, _ in self._shapes[:-1]])
+        self._low, self._high = np.minimum.reduceat(points, starts), np.maximum.reduceat(points, starts)
+        self._origin = self._low.min(axis=0) - 1
+        columns, rows = np.ceil((self._high.max(axis=0) + 1 - self._origin) * scale).astype(int).tolist()
         if max(columns, rows) <= MAP_SIDE and columns * rows <= MAP_BYTES:
             self._picture = np.zeros((rows, columns), np.uint8)
             affine = np.column_stack([np.eye(2) * scale, -self._origin * scale - 0.5])
-            _paint(self._picture, self._charts, affine, scale)
+            _paint(self._picture, self._shapes, affine, scale)
 
     def cuts(self, affines: Floats) -> Floats:
         """Pixels of the window -> pixels of the large picture [M, 2, 3], for world [m] -> pixels of the window."""
@@ -336,34 +326,51 @@ class _Map:
             cv2.warpAffine(self._picture, cut, canvas.shape, dst=canvas, flags=flags)
             return
         canvas.fill(0)
-        centre = np.linalg.solve(affine[:, :2], np.array(canvas.shape) / 2 - affine[:, 2])
-        low, high = centre - self._reach / 2, centre + self._reach / 2
-        near = [chart for chart in self._charts if (chart.low <= high).all() and (chart.high >= low).all()]
-        _paint(canvas, near, affine, self._scale)
+        if self._shapes:
+            centre = np.linalg.solve(affine[:, :2], np.array(canvas.shape) / 2 - affine[:, 2])
+            near = ((self._low < centre + self._reach) & (self._high > centre - self._reach)).all(axis=1)
+            _paint(canvas, [self._shapes[number] for number in np.flatnonzero(near)], affine, self._scale)
 
 
-def _chart(lane: Lane, *, plain: bool) -> _Chart:
-    shade = _PLAIN
-    if not plain and lane.speed_limit is not None:
-        shade = 1 + int(np.clip(round(lane.speed_limit / LIMIT_STEP), 0, LIMIT_SHADES - 1))
-    centre = lane.centre[np.concatenate([[True], np.abs(np.diff(lane.centre, axis=0)).max(axis=1) > 1e-6])]
-    if len(centre) < 2:
-        centre = lane.centre
-    tangent = np.gradient(centre, axis=0)
+def _shapes(lanes: Sequence[Lane]) -> list[_Shape]:
+    """What is painted of the lanes, in paint order: surfaces, boundaries, lane lines."""
+    if not lanes:
+        return []
+    centre = np.concatenate([lane.centre for lane in lanes])
+    lane_of = np.repeat(np.arange(len(lanes)), [len(lane.centre) for lane in lanes])
+    new = np.diff(lane_of, prepend=-1) > 0
+    fresh = new | (np.diff(centre, axis=0, prepend=np.nan) != 0).any(axis=1)  # a point twice has no direction
+    centre, lane_of = centre[fresh], lane_of[fresh]
+    starts = np.searchsorted(lane_of, np.arange(len(lanes) + 1))
+    here = np.arange(len(centre))
+    after, before = np.minimum(here + 1, starts[lane_of + 1] - 1), np.maximum(here - 1, starts[lane_of])
+    tangent = centre[after] - centre[before]
     tangent /= np.hypot(*tangent.T)[:, None].clip(1e-9)
-    left = centre + lane.width / 2 * np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+    half = np.array([lane.width / 2 for lane in lanes])[lane_of, None]
+    left = centre + half * np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
     right = 2 * centre - left
-    boundaries, lines = [], []
-    for side, border in ((left, lane.left), (right, lane.right)):
-        if border == "curb":
-            boundaries.append(side)
-        elif border == "solid":
-            lines.append(side)
-        elif border == "dashed":
-            lines.extend(_dashes(side))
-    edges = np.concatenate([left, right])
-    quads = np.stack([left[:-1], left[1:], right[1:], right[:-1]], axis=1)
-    return _Chart(shade, quads, boundaries, lines, edges.min(axis=0), edges.max(axis=0))
+
+    plain = len({lane.speed_limit for lane in lanes}) < 2
+    shades = [_PLAIN if plain or lane.speed_limit is None else _shade(lane.speed_limit) for lane in lanes]
+    joined = np.flatnonzero(after > here)
+    quads = np.stack([left[joined], left[joined + 1], right[joined + 1], right[joined]], axis=1)
+    surfaces = [(quad, shades[lane], 0) for quad, lane in zip(quads, lane_of[joined].tolist(), strict=True)]
+    boundaries: list[_Shape] = []
+    lines: list[_Shape] = []
+    for number, lane in enumerate(lanes):
+        for edge, border in ((left, lane.left), (right, lane.right)):
+            side = edge[starts[number] : starts[number + 1]]
+            if border == "curb":
+                boundaries.append((side, _BOUNDARY, BOUNDARY_WIDTH))
+            elif border == "solid":
+                lines.append((side, _LINE, LINE_WIDTH))
+            elif border == "dashed":
+                lines.extend((dash, _LINE, LINE_WIDTH) for dash in _dashes(side))
+    return surfaces + boundaries + lines
+
+
+def _shade(limit: float) -> int:
+    return 1 + min(round(limit / LIMIT_STEP), LIMIT_SHADES - 1)
 
 
 def _dashes(line: Floats) -> list[Floats]:
@@ -373,12 +380,13 @@ def _dashes(line: Floats) -> list[Floats]:
     return list(np.stack([np.interp(along, length, line[:, 0]), np.interp(along, length, line[:, 1])], axis=2))
 
 
-def _paint(canvas: Image, charts: Iterable[_Chart], affine: Floats, scale: float) -> None:
-    charts = list(charts)
-    for chart in charts:
-        for quad in _fixed(chart.quads, affine):
-            cv2.fillConvexPoly(canvas, quad, chart.shade, cv2.LINE_8, _SHIFT)
-    for kind, colour, metres in (("boundaries", _BOUNDARY, BOUNDARY_WIDTH), ("lines", _LINE, LINE_WIDTH)):
-        lines = [_fixed(line, affine) for chart in charts for line in getattr(chart, kind)]
-        width = max(1, round(metres * scale))
-        cv2.polylines(canvas, lines, False, colour, width, cv2.LINE_8, _SHIFT)  # noqa: FBT003
+def _paint(canvas: Image, shapes: Sequence[_Shape], affine: Floats, scale: float) -> None:
+    points = _fixed(np.concatenate([shape for shape, _, _ in shapes] or [np.empty((0, 2))]), affine)
+    end = 0
+    for shape, colour, metres in shapes:
+        start, end = end, end + len(shape)
+        if metres:
+            width = max(1, round(metres * scale))
+            cv2.polylines(canvas, [points[start:end]], False, colour, width, cv2.LINE_8, _SHIFT)  # noqa: FBT003
+        else:
+            cv2.fillConvexPoly(canvas, points[start:end], colour, cv2.LINE_8, _SHIFT)
