@@ -24,7 +24,7 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -66,6 +66,18 @@ RESULT_FILES = (*(f"{part}.safetensors" for part in ARRAYS), "curves.parquet", "
 PLAN_VERSION = 1
 VALUE_LIMIT = 4000  # characters of a parameter or tag; MLflow takes 6000 and 8000, its databases 8000
 PARENT, COMMIT, NOTE = "mlflow.parentRunId", "mlflow.source.git.commit", "mlflow.note.content"
+# Columns [pixels] of the view of all cells that MLflow's pages open with `?viewStateShareKey=cells`.
+VIEW = {
+    "params.`heads`": 90,
+    "params.`fraction`": 80,
+    "params.`encoder_seed`": 110,
+    "params.`policy_seeds`": 110,
+    "metrics.`final/acceleration_accuracy`": 200,
+    "metrics.`final/acceleration_accuracy/sd`": 210,
+    "metrics.`final/steering_loss`": 160,
+    "metrics.`floor`": 80,
+    "tags.`sweep`": 110,
+}
 
 Status = Literal["FINISHED", "FAILED", "KILLED"]
 Point = tuple[str, int, float]  # metric, epoch, value
@@ -122,10 +134,10 @@ class CellRun:
                 self._pending = batch + self._pending
             raise
 
-    def stop(self) -> None:
+    def stop(self, *, wait: bool = True) -> None:
         """End the thread. Points it has not written stay."""
         self._end.set()
-        if self._thread is not None:
+        if wait and self._thread is not None:
             self._thread.join()
 
     def finish(self, points: Iterable[Point]) -> None:
@@ -167,19 +179,20 @@ class Tracker:
     def _open_experiment(self, name: str, folder: Path | None) -> str:
         found = self.client.get_experiment_by_name(name)
         if found is None:
-            tags = {NOTE: "Sweeps, their cells, and the policy seeds of each cell. Written by study/tracking.py."}
-            try:
-                return str(self.client.create_experiment(name, str(folder) if folder else None, tags))
-            except MlflowException:  # another process was faster, or nothing can be created
-                found = self.client.get_experiment_by_name(name)
-                if found is None:
-                    raise
-        if found.lifecycle_stage != "active":
+            with suppress(MlflowException):  # another process was faster, or the next line says what is wrong
+                self.client.create_experiment(name, str(folder) if folder else None)
+            found = self.client.get_experiment_by_name(name)
+        if found is None or found.lifecycle_stage != "active":
             raise BadInputError(
-                f"experiment '{name}' in {self.uri} is deleted; run "
-                f"MLFLOW_TRACKING_URI={self.uri} mlflow experiments restore -x {found.experiment_id}"
+                f"experiment '{name}' in {self.uri} cannot be used; if it is deleted, run: "
+                f"MLFLOW_TRACKING_URI={self.uri} mlflow experiments restore --experiment-id "
+                f"{found.experiment_id if found else '...'}"
             )
-        return str(found.experiment_id)
+        number = str(found.experiment_id)
+        for key, value in _welcome(number).items():
+            if key not in found.tags:
+                self.client.set_experiment_tag(number, key, value)
+        return number
 
     def _follow(self, path: Path, folder: Path) -> None:
         """Let the database point to the artifacts beside it: MLflow stores whole paths, and folders are moved."""
@@ -202,7 +215,7 @@ class Tracker:
         """Turn the store's troubles into one clear error; mistakes of this program stay what they are."""
         try:
             yield
-        except (MlflowException, SQLAlchemyError, OSError) as error:
+        except (MlflowException, SQLAlchemyError, OSError, ImportError) as error:  # or a database's driver is missing
             code = getattr(error, "error_code", None)
             if code in ("INVALID_PARAMETER_VALUE", "BAD_REQUEST") and not opening:
                 raise
@@ -256,14 +269,21 @@ class Tracker:
                 self.client.update_run(run_id, status="RUNNING")
             else:
                 identity = {"kind": "sweep", "sweep": grid.name, "profile": profile, "plan_key": key, NOTE: grid.title}
+                identity["mlflow.source.name"] = f"python -m study.sweep {grid.name} --profile {profile}"
                 created = self._create(name, identity)
                 run_id = str(self._search(f"tags.plan_key = '{key}'")[0].info.run_id)
                 if created != run_id:  # a server has no lock: of two parents started at once, both take the first
                     self.client.delete_run(created)
+            for run in sweeps:
+                # A database file belongs to one machine, where one sweep runs at a time: others that say so were killed.
+                if self._lock and run.info.status == "RUNNING" and run.info.run_id != run_id:
+                    self._close_cells(run.info.run_id)
+                    self._close(run.info.run_id, "KILLED", {"reason": "another sweep was started"})
             _insert(self.client.log_batch, run_id, params=params)
             self.client.log_batch(run_id, tags=[RunTag(name, _short(value)) for name, value in tags.items() if value])
             self.client.log_dict(run_id, plan, "plan.json")
-            self.client.log_dict(run_id, dict(data), "data.json")
+            if data or not mine:  # frames that were deleted since are still what the results were made from
+                self.client.log_dict(run_id, dict(data), "data.json")
             self.client.log_dict(run_id, facts, "provenance.json")
             self.client.log_text(run_id, str(provenance.get("diff") or ""), "uncommitted.diff")
             if data:
@@ -277,16 +297,18 @@ class Tracker:
         return ", ".join(f"{planned[key].label} from {sweep}" for key, sweep in others.items() if sweep != name)
 
     def close_sweep(self, sweep_run_id: str, status: Status) -> None:
-        """End a sweep run, and whatever cell run under it still says RUNNING."""
-        with self._guard():
-            for run in self._search(
-                f"tags.kind = 'cell' and attributes.status = 'RUNNING' and tags.`{PARENT}` = '{sweep_run_id}'"
-            ):
-                self._close(run.info.run_id, "KILLED", {"reason": "the sweep ended"})
+        """End a sweep run, and whatever cell run under it still says RUNNING. Quick when it was stopped (KILLED)."""
+        with self._guard(), _few_tries() if status == "KILLED" else nullcontext():
+            self._close_cells(sweep_run_id)
             planned = self._json(sweep_run_id, "plan.json")["planned"]
             done = len(self._finished(planned))
             self.client.set_tag(sweep_run_id, "cells", f"{done} of {len(planned)} finished")
             self.client.set_terminated(sweep_run_id, status)
+
+    def _close_cells(self, sweep_run_id: str) -> None:
+        running = f"tags.kind = 'cell' and attributes.status = 'RUNNING' and tags.`{PARENT}` = '{sweep_run_id}'"
+        for run in self._search(running):
+            self._close(run.info.run_id, "KILLED", {"reason": "the sweep ended"})
 
     def sweep_run(self, name: str, profile: str | None = None) -> str:
         """Run id of the latest sweep run of that name. Raises BadInputError naming the sweeps there are."""
@@ -431,6 +453,7 @@ class Tracker:
 
     def interrupt(self, cell_run: CellRun) -> None:
         """End an attempt that was stopped, quickly; when the store does not answer, the next attempt closes it."""
+        cell_run.stop(wait=False)
         with suppress(TrackerLostError), self._guard(), _few_tries():
             self._close(cell_run.run_id, "KILLED", {"reason": "stopped"})
 
@@ -587,6 +610,26 @@ def _dataset(data: Mapping[str, Any]) -> DatasetInput:
     profile = json.dumps({name: value for name, value in _flat(data).items() if isinstance(value, int | float)})
     entity = Dataset("frames", digest[:36], "code", source, profile=profile[:100_000])
     return DatasetInput(entity, [InputTag("mlflow.data.context", "train and test")])
+
+
+def _welcome(experiment: str) -> dict[str, str]:
+    """Tags that make an experiment's page readable: a word on what is there, and a view of all cells."""
+    view = {
+        "searchFilter": "tags.kind = 'cell' and attributes.status != 'KILLED'",
+        "orderByKey": "params.`heads`",  # any order but by date: MLflow then lists cells, not sweeps to unfold
+        "orderByAsc": True,
+        "startTime": "ALL",
+        "lifecycleFilter": "Active",
+        "datasetsFilter": [],
+        "selectedColumns": list(VIEW),
+        "columnOrder": list(VIEW),
+        "columnWidths": VIEW,
+    }
+    link = f"#/experiments/{experiment}/runs?viewStateShareKey=cells&workflowType=machine_learning"
+    return {
+        NOTE: f"Each sweep unfolds to its cells, each cell to its policy seeds. [All cells with their scores]({link})",
+        "mlflow.sharedViewState.cells": json.dumps(view),
+    }
 
 
 def _opened(run: Run) -> int:

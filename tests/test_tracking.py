@@ -1,6 +1,7 @@
 """MLflow as the store of results, on real stores."""
 
 import http.server
+import json
 import os
 import shutil
 import socket
@@ -225,6 +226,15 @@ def test_a_list_of_runs_reads_well(tracker):
     assert "mlflow.user" not in run.data.tags
 
 
+def test_the_view_of_all_cells_shows_columns_that_there_are(tracker):
+    planned = cells("view")
+    run = tracker.client.get_run(train(tracker, open_sweep(tracker, planned), planned, "view-0"))
+    view = json.loads(tracker.client.get_experiment(tracker.experiment).tags["mlflow.sharedViewState.cells"])
+    there = {f"{kind}.`{name}`" for kind in ("params", "metrics", "tags") for name in getattr(run.data, kind)}
+    assert set(view["selectedColumns"]) <= there
+    assert [found.info.run_id for found in tracker._search(view["searchFilter"])] == [run.info.run_id]
+
+
 def test_a_result_of_another_cell_is_refused(tracker):
     planned = cells("other")
     run = start(tracker, open_sweep(tracker, planned), planned, "other-0")
@@ -373,6 +383,21 @@ def test_cells_of_another_sweep_are_found_and_the_reuse_is_shown(tracker):
     record = tracker.read_sweep("datasize")
     assert set(record.results) == {"reuse-0"}
     assert not record.complete
+
+
+def test_a_sweep_taken_up_after_its_frames_were_deleted_keeps_their_manifest(tracker):
+    planned = cells("gone")
+    open_sweep(tracker, planned)
+    tracker.open_sweep(GRID, "laptop", SETTINGS, planned, {}, ORIGIN)
+    assert tracker.read_sweep("heads").data == DATA
+
+
+def test_what_a_killed_sweep_left_running_is_closed_by_the_next(tracker):
+    planned, others = cells("killed"), cells("next")
+    sweep = open_sweep(tracker, planned)
+    run = start(tracker, sweep, planned, "killed-0")
+    after = open_sweep(tracker, others)
+    assert (status(tracker, sweep), status(tracker, run.run_id), status(tracker, after)) == (*["KILLED"] * 2, "RUNNING")
 
 
 def test_closing_a_sweep_leaves_nothing_running(tracker):
