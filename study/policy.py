@@ -1,0 +1,573 @@
+"""Policies on a frozen latent (Sec. III-B.3, IV-C): all seeds at once, as one stack of tensors.
+
+Two small networks with no weight in common learn from z: one gives the steering, one the logits of the three
+accelerations. The seeds never touch each other: the loss is their sum and Adam works number by number, so each seed
+becomes what it would have become alone. A unit of work is therefore one network on a group of seeds. On a CPU a group
+is one seed, its step fits into one core's cache, and each core takes the next group; results then depend neither on
+the number of cores nor on the seeds beside. On a GPU all seeds are one group.
+
+Suffixes: S seeds, G seeds of a group, B rows of a batch, N frames, H hidden units, O outputs, Z = 64 latent numbers.
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import math
+import queue
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import lightning
+import numpy as np
+import pandas as pd
+import torch
+from lightning.fabric.plugins.environments.lightning import LightningEnvironment
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional
+
+from study.config import (
+    ACCELERATION_HIDDEN,
+    ACCELERATIONS,
+    DROPOUT,
+    LATENT,
+    STEERING_HIDDEN,
+    BadInputError,
+    PolicySettings,
+)
+from study.result import CURVE_COLUMNS, TrainingDivergedError
+
+Log = Callable[[int, dict[str, float]], None]
+Progress = Callable[[int, int], None]
+Arrays = dict[str, NDArray[Any]]
+
+WIDTHS = {
+    "steering": (LATENT, *STEERING_HIDDEN, 1),
+    "acceleration": (LATENT, *ACCELERATION_HIDDEN, len(ACCELERATIONS)),
+}
+METRICS = ("steering_loss", "acceleration_accuracy", "balanced_accuracy", "cross_entropy")
+SPLITS = ("train", "test")
+
+_INIT, _EPOCH, _SUBSET = range(3)  # purposes of random numbers
+_WORD = 32  # mask bits in a word
+_BIT = 0x40000000  # the one bit that makes an int32 the float32 2.0
+_DROPPED = -1e30  # takes a unit below zero, where the ReLU ends it
+_KEPT = 1 / (1 - DROPOUT)
+_ROWS = 2048  # evaluated at once: their hidden units fit into a core's cache
+
+assert DROPOUT == 0.5, "masks are made of random bits"
+
+
+@dataclass(frozen=True)
+class TrainedPolicies:
+    """S trained policies and how they came about; N test frames.
+
+    `weights`: "<network>_<layer>_weight" [S, in, out] and "..._bias" [S, out] float32 for networks "steering" and
+    "acceleration", layers 0 to 2; "z_mean", "z_std" [64]; "z_l2" [1] uint8: 1 where z is scaled to unit length.
+    `curves`: one row per measured point, columns CURVE_COLUMNS, of the policies without dropout after each epoch.
+    `acceleration` [S, N] uint8 class and `steering` [S, N] float32: on the test frames after the last epoch.
+    """
+
+    weights: Arrays
+    curves: pd.DataFrame
+    acceleration: NDArray[np.uint8]
+    steering: NDArray[np.float32]
+    seconds: float
+
+
+# --- the latent -----------------------------------------------------------------------------------------------------
+
+
+def normalisation(z_train: NDArray[np.float32], how: str) -> Arrays:
+    """What `normalise` needs to know, from the policy train split only (PAPER.md 2.5)."""
+    mean, std = np.zeros(LATENT, np.float32), np.ones(LATENT, np.float32)
+    if how == "zscore":
+        mean, std = z_train.mean(0, dtype=np.float64), z_train.std(0, dtype=np.float64)
+        std = np.where(std > 0, std, 1.0)  # a dead latent number stays 0
+    return {
+        "z_mean": mean.astype(np.float32),
+        "z_std": std.astype(np.float32),
+        "z_l2": np.array([how == "l2"], np.uint8),
+    }
+
+
+def normalise(weights: Mapping[str, NDArray[Any]], z: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The latent [N, 64] as the policies see it."""
+    scaled: NDArray[np.float32] = (z - weights["z_mean"]) / weights["z_std"]
+    if weights["z_l2"][0]:
+        scaled /= np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), np.finfo(np.float32).tiny)
+    return scaled
+
+
+# --- random numbers -------------------------------------------------------------------------------------------------
+
+
+class Draws(NamedTuple):
+    """All chance of one epoch: `order` [S, N] int64 and, for each hidden layer, mask bits [S, N * H / 32] int32."""
+
+    order: Tensor
+    bits: dict[str, tuple[Tensor, Tensor]]
+
+
+def draw_epoch(seeds: Sequence[int], epoch: int, frames: int) -> Draws:
+    """The order of the data and the dropout bits of each seed, a function of (seed, epoch) only.
+
+    Made on the CPU whatever the device, so that a seed means the same everywhere; one upload an epoch.
+    """
+    words = {name: tuple(width // _WORD for width in widths[1:-1]) for name, widths in WIDTHS.items()}
+    ends = np.cumsum([0, *(frames * each for layers in words.values() for each in layers)])
+    order = np.empty((len(seeds), frames), np.int64)
+    bits = np.empty((len(seeds), ends[-1]), np.int32)
+    for row, seed in enumerate(seeds):
+        rng = np.random.Generator(np.random.SFC64([seed, _EPOCH, epoch]))
+        order[row] = rng.permutation(frames)
+        bits[row] = rng.bit_generator.random_raw(math.ceil(ends[-1] / 2)).view(np.int32)[: ends[-1]]
+    parts = iter([torch.from_numpy(bits[:, a:b]) for a, b in itertools.pairwise(ends)])
+    return Draws(torch.from_numpy(order), {name: (next(parts), next(parts)) for name in WIDTHS})
+
+
+def _initial(seed: int) -> Iterator[tuple[str, Tensor]]:
+    """Weights as torch's Linear draws them: uniform within 1 / sqrt(inputs)."""
+    rng = np.random.default_rng([seed, _INIT])
+    for name, widths in WIDTHS.items():
+        for layer, (inputs, outputs) in enumerate(itertools.pairwise(widths)):
+            bound = inputs**-0.5
+            for part, shape in (("weight", (inputs, outputs)), ("bias", (outputs,))):
+                values = rng.uniform(-bound, bound, shape).astype(np.float32)
+                yield f"{name}_{layer}_{part}", torch.from_numpy(values)
+
+
+# --- the networks ---------------------------------------------------------------------------------------------------
+
+
+class Layer(NamedTuple):
+    """One fully connected layer of G seeds: weight [G, in, out], bias [G, 1, out], and where their gradients go."""
+
+    weight: Tensor
+    bias: Tensor
+    weight_gradient: Tensor
+    bias_gradient: Tensor
+
+
+def dropout_mask(words: Tensor, rows: int) -> Tensor:
+    """Words of 32 random bits [G, B * H / 32] as float32 [G, B, H]: 2.0 where the bit is set, 0.0 where not."""
+    shifts = torch.arange(_WORD, dtype=torch.int32, device=words.device)[:, None]
+    bits = torch.bitwise_left_shift(words[:, None], shifts).bitwise_and_(_BIT)
+    return bits.view(torch.float32).view(len(words), rows, -1)
+
+
+def forward_backward(
+    layers: Sequence[Layer],
+    x: Tensor,
+    words: Sequence[Tensor],
+    output_gradient: Callable[[Tensor], Tensor],
+) -> None:
+    """One pass of G policies over their batches x [G, B, 64]; writes the gradients of all layers.
+
+    `output_gradient` maps outputs [G, O, B] to the loss's gradient there. ReLU and Dropout(0.5) cost three passes over
+    memory instead of torch's six: a unit to drop starts its sum far below zero, so the ReLU drops it, and its zero
+    tells the way back, too. What dropout multiplies by, 2, waits for the next product.
+    """
+    activations = [x]
+    for depth, (layer, bits) in enumerate(zip(layers[:-1], words, strict=True)):
+        hidden = dropout_mask(bits, x.shape[1])
+        hidden.baddbmm_(activations[-1], layer.weight, beta=_DROPPED, alpha=_KEPT if depth else 1)
+        activations.append(hidden.add_(layer.bias).relu_())
+    outputs = torch.baddbmm(layers[-1].bias, activations[-1], layers[-1].weight, alpha=_KEPT)
+    gradient = output_gradient(outputs.transpose(1, 2).contiguous()).transpose(1, 2)  # O first: softmax in wide rows
+    for depth in reversed(range(len(layers))):
+        layer, hidden = layers[depth], activations[depth]
+        torch.sum(gradient, 1, keepdim=True, out=layer.bias_gradient)
+        layer.weight_gradient.baddbmm_(hidden.transpose(1, 2), gradient, beta=0, alpha=_KEPT if depth else 1)
+        if depth:
+            gradient = torch.bmm(gradient, layer.weight.transpose(1, 2).mul(_KEPT))
+            torch.ops.aten.threshold_backward.grad_input(gradient, hidden, 0.0, grad_input=gradient)
+
+
+def outputs(weights: Sequence[tuple[Tensor, Tensor]], x: Tensor) -> Tensor:
+    """Outputs [G, N, O] of G policies without dropout for x [N, 64]."""
+    parts = []
+    for start in range(0, len(x), _ROWS):
+        hidden = x[start : start + _ROWS].expand(len(weights[0][0]), -1, -1)
+        for depth, (weight, bias) in enumerate(weights):
+            hidden = torch.baddbmm(bias, hidden, weight)
+            if depth < len(weights) - 1:
+                hidden.relu_()
+        parts.append(hidden)
+    return torch.cat(parts, 1)
+
+
+def predict(weights: Mapping[str, NDArray[Any]], z: NDArray[np.float32]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Steering [S, N] and logits of the accelerations [S, N, 3], float32, for latents [N, 64] as encoded."""
+    x = torch.from_numpy(normalise(weights, z))
+    results = {}
+    with torch.inference_mode():
+        for name, widths in WIDTHS.items():
+            stack = [
+                (
+                    torch.from_numpy(weights[f"{name}_{layer}_weight"]),
+                    torch.from_numpy(weights[f"{name}_{layer}_bias"])[:, None],
+                )
+                for layer in range(len(widths) - 1)
+            ]
+            seeds = range(len(stack[0][0]))
+            results[name] = torch.cat([outputs([(w[s : s + 1], b[s : s + 1]) for w, b in stack], x) for s in seeds])
+    return results["steering"][..., 0].numpy(), results["acceleration"].numpy()
+
+
+# --- metrics --------------------------------------------------------------------------------------------------------
+
+
+class Labels(NamedTuple):
+    """What a policy should say: steering [N] float32 and acceleration class [N] int64."""
+
+    steering: Tensor
+    acceleration: Tensor
+
+
+def measure(steering: Tensor, logits: Tensor, labels: Labels) -> Tensor:
+    """METRICS of each seed, [4, S], from steering [S, N] and logits [S, N, 3].
+
+    Balanced accuracy is the mean over the classes that occur of the share found of each.
+    """
+    errors = functional.smooth_l1_loss(steering, labels.steering.expand_as(steering), reduction="none").mean(1)
+    by_class = logits.transpose(1, 2).contiguous()
+    right = (by_class.argmax(1) == labels.acceleration).to(torch.float32)
+    there = functional.one_hot(labels.acceleration, len(ACCELERATIONS)).to(torch.float32)
+    counts = there.sum(0)
+    balanced = (right @ there / counts.clamp(min=1)).sum(1) / (counts > 0).sum()
+    surprise = -(by_class.log_softmax(1) * there.T).sum(1).mean(1)
+    return torch.stack([errors, right.mean(1), balanced, surprise])
+
+
+# --- training -------------------------------------------------------------------------------------------------------
+
+
+class Crew:
+    """Cores that share out groups of seeds: one thread for each core, each of which computes alone.
+
+    Threads inside of each operation, torch's own way, would wait for each other forty times a step.
+    """
+
+    def __init__(self, threads: int) -> None:
+        self._pool = ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,))
+        self._threads = threads
+
+    def run(self, jobs: Sequence[Callable[[], None]]) -> None:
+        """Do all jobs; the longest should come first."""
+        waiting: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        for job in jobs:
+            waiting.put(job)
+
+        def work() -> None:
+            with torch.inference_mode():
+                while True:
+                    try:
+                        job = waiting.get_nowait()
+                    except queue.Empty:
+                        return
+                    job()
+
+        for done in [self._pool.submit(work) for _ in range(self._threads)]:
+            done.result()
+
+    def close(self) -> None:
+        """End the threads."""
+        self._pool.shutdown()
+
+
+@dataclass(frozen=True)
+class PolicyData:
+    """What policies learn from and are measured on; x as `normalise` gives it.
+
+    `x` [N, 64] and `labels` of the train split; `views`: for each split the x and labels that metrics are taken on.
+    """
+
+    x: Tensor
+    labels: Labels
+    views: dict[str, tuple[Tensor, Labels]]
+
+
+class PolicyEnsemble(lightning.LightningModule):
+    """S policies as stacked tensors: weights [S, in, out], biases [S, out], gradients written by hand.
+
+    One training step is one batch of every seed. `measured` holds METRICS after each epoch: [epoch][split][4, S].
+    """
+
+    def __init__(
+        self,
+        seeds: Sequence[int],
+        settings: PolicySettings,
+        data: PolicyData,
+        crew: Crew | None,
+        after_epoch: Callable[[int, dict[str, Tensor]], None],
+    ) -> None:
+        super().__init__()
+        self.automatic_optimization = False
+        self.seeds, self.settings = tuple(seeds), settings
+        self._data, self._crew, self._after_epoch = data, crew, after_epoch
+        for stacked in zip(*(_initial(seed) for seed in seeds), strict=True):
+            self.register_parameter(stacked[0][0], nn.Parameter(torch.stack([values for _, values in stacked])))
+        each = [slice(row, row + 1) for row in range(len(self.seeds))]
+        self._groups = each if crew else [slice(0, len(self.seeds))]
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        """Adam; fused, because the stack is small numbers in many places."""
+        return torch.optim.Adam(self.parameters(), lr=self.settings.lr, fused=True)
+
+    def on_train_start(self) -> None:
+        """Cut the stack into groups, once: the layers are views of weights and gradients, which stay where they are."""
+        for parameter in self.parameters():
+            parameter.grad = torch.zeros_like(parameter)
+        self._layers = {
+            name: [[self._layer(name, layer, group) for layer in range(len(widths) - 1)] for group in self._groups]
+            for name, widths in WIDTHS.items()
+        }
+
+    def _layer(self, name: str, layer: int, group: slice) -> Layer:
+        weight, bias = (self.get_parameter(f"{name}_{layer}_{part}") for part in ("weight", "bias"))
+        assert weight.grad is not None
+        assert bias.grad is not None
+        return Layer(weight.detach()[group], bias.detach()[group, None], weight.grad[group], bias.grad[group, None])
+
+    def on_train_epoch_start(self) -> None:
+        """Draw all chance of the epoch, and bring the labels into its order."""
+        order, bits = draw_epoch(self.seeds, self.current_epoch, len(self._data.x))
+        self._order = order.to(self.device)
+        self._bits = {name: [words.to(self.device) for words in layers] for name, layers in bits.items()}
+        self._steering = self._data.labels.steering[self._order]
+        self._acceleration = self._data.labels.acceleration[self._order]
+
+    def training_step(self, batch: int) -> None:
+        """One batch of every seed: the rows at `batch` in each seed's own order."""
+        start = batch * self.settings.batch
+        rows = slice(start, min(start + self.settings.batch, len(self._data.x)))
+        self._share_out(lambda name, index: self._pass(name, index, rows))
+        self.optimizers(use_pl_optimizer=False).step()  # type: ignore[union-attr]
+
+    def _pass(self, name: str, index: int, rows: slice) -> None:
+        group, count = self._groups[index], rows.stop - rows.start
+        order = self._order[group, rows]
+        x = torch.index_select(self._data.x, 0, order.reshape(-1)).view(len(order), count, LATENT)
+        frames = len(self._data.x)
+        words = []
+        for layer in self._bits[name]:
+            each = layer.shape[1] // frames
+            words.append(layer[group, rows.start * each : rows.stop * each])
+        gradient = _steering_gradient if name == "steering" else _acceleration_gradient
+        labels = (self._steering if name == "steering" else self._acceleration)[group, None, rows]
+        forward_backward(self._layers[name][index], x, words, lambda outputs: gradient(outputs, labels))
+
+    def on_train_epoch_end(self) -> None:
+        """Measure every policy without dropout."""
+        self._after_epoch(
+            self.current_epoch + 1,
+            {split: measure(*self.outputs(x), labels) for split, (x, labels) in self._data.views.items()},
+        )
+
+    def outputs(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Steering [S, N] and logits [S, N, 3] without dropout."""
+        results = {name: x.new_empty((len(self.seeds), len(x), widths[-1])) for name, widths in WIDTHS.items()}
+
+        def fill(name: str, index: int) -> None:
+            stack = [(layer.weight, layer.bias) for layer in self._layers[name][index]]
+            results[name][self._groups[index]] = outputs(stack, x)
+
+        self._share_out(fill)
+        return results["steering"][..., 0], results["acceleration"]
+
+    def _share_out(self, work: Callable[[str, int], None]) -> None:
+        """Do `work` for each network and group; steering, the larger network, comes first."""
+        jobs = [partial(work, name, index) for name in WIDTHS for index in range(len(self._groups))]
+        if self._crew:
+            self._crew.run(jobs)
+        else:
+            with torch.no_grad():
+                for job in jobs:
+                    job()
+
+
+def _steering_gradient(outputs: Tensor, labels: Tensor) -> Tensor:
+    """Gradient of the mean smooth L1 loss; outputs and labels [G, 1, B]."""
+    return outputs.sub_(labels).clamp_(-1, 1).div_(outputs.shape[2])
+
+
+def _acceleration_gradient(logits: Tensor, labels: Tensor) -> Tensor:
+    """Gradient of the mean cross-entropy; logits [G, 3, B], labels [G, 1, B]."""
+    gradient = logits.softmax(1)
+    gradient.scatter_add_(1, labels, gradient.new_full((), -1.0).expand_as(labels))
+    return gradient.div_(logits.shape[2])
+
+
+def train_policies(
+    z_train: NDArray[np.float32],
+    z_test: NDArray[np.float32],
+    labels_train: Any,
+    labels_test: Any,
+    seeds: Sequence[int],
+    settings: PolicySettings,
+    *,
+    device: str = "cpu",
+    log: Log | None = None,
+    progress: Progress | None = None,
+) -> TrainedPolicies:
+    """Train one policy per seed on latents [N, 64] float32 and labels with columns "steering" and "acceleration".
+
+    Train metrics are taken on a random part of the train split, the same for all seeds and epochs, that is no larger
+    than the test split. `log(epoch, means over the seeds)` with names such as "test/acceleration_accuracy".
+    Raises BadInputError for data that cannot be learnt from, TrainingDivergedError for a loss that is not finite.
+    """
+    started = time.perf_counter()
+    _check(z_train, z_test, labels_train, labels_test, seeds, settings)
+    scaling = normalisation(z_train, settings.normalise)
+    data = _policy_data(scaling, (z_train, labels_train), (z_test, labels_test), torch.device(device))
+    points: list[pd.DataFrame] = []
+
+    def after_epoch(epoch: int, measured: dict[str, Tensor]) -> None:
+        values = {split: metrics.cpu().numpy() for split, metrics in measured.items()}
+        for metrics in values.values():
+            broken = ~np.isfinite(metrics).all(0)
+            if broken.any():
+                raise TrainingDivergedError(
+                    f"policies: the loss of seed {seeds[int(broken.argmax())]} is not finite after epoch {epoch}; "
+                    f"try a lower policy.lr than {settings.lr:g}"
+                )
+        points.append(_points(seeds, epoch, values))
+        if log:
+            log(
+                epoch,
+                {
+                    f"{split}/{metric}": float(each.mean())
+                    for split, metrics in values.items()
+                    for metric, each in zip(METRICS, metrics, strict=True)
+                },
+            )
+        if progress:
+            progress(epoch, settings.epochs)
+
+    with _crew(device) as crew:
+        ensemble = PolicyEnsemble(seeds, settings, data, crew, after_epoch)
+        _fit(ensemble, settings, math.ceil(len(z_train) / settings.batch), device)
+        steering, logits = ensemble.outputs(data.views["test"][0])
+    return TrainedPolicies(
+        weights={name: values.detach().cpu().numpy() for name, values in ensemble.named_parameters()} | scaling,
+        curves=pd.concat(points, ignore_index=True)[list(CURVE_COLUMNS)],
+        acceleration=logits.argmax(2).to(torch.uint8).cpu().numpy(),
+        steering=steering.cpu().numpy(),
+        seconds=time.perf_counter() - started,
+    )
+
+
+def _check(
+    z_train: NDArray[Any],
+    z_test: NDArray[Any],
+    labels_train: Any,
+    labels_test: Any,
+    seeds: Sequence[int],
+    settings: PolicySettings,
+) -> None:
+    if not seeds or len(set(seeds)) != len(seeds):
+        raise BadInputError(f"policy seeds {list(seeds)}: at least one is needed, and each once")
+    for split, z, labels in (("train", z_train, labels_train), ("test", z_test, labels_test)):
+        if z.ndim != 2 or z.shape[1] != LATENT or not len(z) or z.dtype != np.float32:
+            raise BadInputError(f"{split} latents are {z.dtype} {list(z.shape)}; float32 [frames, {LATENT}] is needed")
+        if not np.isfinite(z).all():
+            raise BadInputError(f"{split} latents hold values that are not finite; train the encoder again")
+        for column in ("steering", "acceleration"):
+            values = np.asarray(labels[column])
+            if values.shape != (len(z),) or not np.isfinite(values).all():
+                raise BadInputError(f"{split} labels '{column}' must be {len(z)} finite numbers, one for each latent")
+        if not np.isin(labels["acceleration"], range(len(ACCELERATIONS))).all():
+            raise BadInputError(f"{split} labels 'acceleration' must be classes 0 to {len(ACCELERATIONS) - 1}")
+    if settings.batch > len(z_train):
+        raise BadInputError(
+            f"policy.batch is {settings.batch}, more than the {len(z_train)} policy train frames; "
+            f"set --policy.batch to at most that"
+        )
+
+
+def _policy_data(
+    scaling: Arrays, train: tuple[NDArray[Any], Any], test: tuple[NDArray[Any], Any], device: torch.device
+) -> PolicyData:
+    (x_train, y_train), (x_test, y_test) = (
+        (
+            torch.from_numpy(normalise(scaling, z)).to(device),
+            Labels(
+                torch.from_numpy(np.array(labels["steering"], np.float32)).to(device),
+                torch.from_numpy(np.array(labels["acceleration"], np.int64)).to(device),
+            ),
+        )
+        for z, labels in (train, test)
+    )
+    some = np.random.default_rng(_SUBSET).permutation(len(x_train))[: len(x_test)]
+    part = torch.from_numpy(np.sort(some)).to(device)
+    seen = (x_train[part], Labels(*(values[part] for values in y_train)))
+    return PolicyData(x_train, y_train, {"train": seen, "test": (x_test, y_test)})
+
+
+def _points(seeds: Sequence[int], epoch: int, values: dict[str, NDArray[Any]]) -> pd.DataFrame:
+    """Rows of the tidy table for one epoch."""
+    index = pd.MultiIndex.from_product([values, METRICS, seeds], names=["split", "metric", "policy_seed"])
+    numbers = np.concatenate([metrics.reshape(-1) for metrics in values.values()])
+    return (
+        pd.DataFrame({"value": numbers.astype(np.float64)}, index=index)
+        .reset_index()
+        .assign(stage="policy", epoch=epoch)
+    )
+
+
+@contextmanager
+def _crew(device: str) -> Iterator[Crew | None]:
+    if device != "cpu":
+        yield None
+        return
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # threads that wait inside of torch would take the cores from the crew
+    crew = Crew(threads)
+    try:
+        yield crew
+    finally:
+        crew.close()
+        torch.set_num_threads(threads)
+
+
+def _fit(ensemble: PolicyEnsemble, settings: PolicySettings, steps: int, device: str) -> None:
+    place = torch.device(device)
+    with _quiet():
+        trainer = lightning.Trainer(
+            accelerator="gpu" if place.type == "cuda" else "cpu",
+            devices=1 if place.index is None else [place.index],
+            max_epochs=settings.epochs,
+            plugins=[LightningEnvironment()],  # one process, also inside a Slurm job
+            logger=False,
+            enable_checkpointing=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+        )
+        try:
+            trainer.fit(ensemble, train_dataloaders=range(steps))
+        except SystemExit as error:
+            if isinstance(error.__context__, KeyboardInterrupt):  # Lightning makes Ctrl-C an exit with code 1
+                raise KeyboardInterrupt from None
+            raise
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Lightning says nothing about devices, loaders and its own products."""
+    logger = logging.getLogger("lightning.pytorch")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", module="lightning.*")
+            yield
+    finally:
+        logger.setLevel(level)
