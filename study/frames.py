@@ -46,6 +46,7 @@ from study.config import (
     FramesSettings,
     content_key,
 )
+from study.cost import size
 from study.episode import episode_digest, file_digest, read_episode
 from study.selection import LABELS, SETS, Columns, Indices, candidates, choose, histograms
 
@@ -407,7 +408,7 @@ class _Build:
         free = shutil.disk_usage(self.folder.parent).free
         if need > free:
             raise BadInputError(
-                f"{self.folder.parent} has {free / 1e9:.2f} GB free and the frames need {need / 1e9:.2f} GB: free some "
+                f"{self.folder.parent} has {size(free)} free and the frames need {size(need)}: free some "
                 "room, name another folder, or lower --frames.encoder and --frames.policy"
             )
 
@@ -417,13 +418,13 @@ class _Build:
             for key, shape in SHAPES.items():
                 path = self.draft / name / f"{key}.npy"
                 whole = (plan[name]["frames"], *shape)
-                size = _header(whole) + int(np.prod(whole))
-                if path.is_file() and path.stat().st_size == size:
+                length = _header(whole) + int(np.prod(whole))
+                if path.is_file() and path.stat().st_size == length:
                     continue
                 (self.draft / "journal").unlink(missing_ok=True)
                 np.lib.format.open_memmap(path, mode="w+", dtype=np.uint8, shape=whole)
                 with path.open("r+b") as stream:
-                    os.posix_fallocate(stream.fileno(), 0, size)
+                    os.posix_fallocate(stream.fileno(), 0, length)
 
     def _render(
         self, pool: ProcessPoolExecutor | None, plan: dict[str, Any], progress: Progress

@@ -159,7 +159,7 @@ def test_no_drive_serves_both_sets(drives, tmp_path):
 @pytest.mark.parametrize(
     ("settings", "says"),
     [
-        ({"encoder": 10**10}, "GB free and the frames need"),
+        ({"encoder": 10**10}, "free and the frames need"),
         ({"policy": 5000}, "policy set needs 4000 training frames and its drives give"),
     ],
 )
