@@ -419,10 +419,9 @@ class _Build:
                 path = self.draft / name / f"{key}.npy"
                 whole = (plan[name]["frames"], *shape)
                 length = _header(whole) + int(np.prod(whole))
-                if path.is_file() and path.stat().st_size == length:
-                    continue
-                (self.draft / "journal").unlink(missing_ok=True)
-                np.lib.format.open_memmap(path, mode="w+", dtype=np.uint8, shape=whole)
+                if not (path.is_file() and path.stat().st_size == length):
+                    (self.draft / "journal").unlink(missing_ok=True)
+                    np.lib.format.open_memmap(path, mode="w+", dtype=np.uint8, shape=whole)
                 with path.open("r+b") as stream:
                     os.posix_fallocate(stream.fileno(), 0, length)
 
