@@ -215,12 +215,9 @@ def _lane_turns(lanes: int, turns: list[Turn], straight_lanes: int) -> list[list
     """Which turns each lane of an approach offers, lane 0 next to the middle; two lanes never merge in a junction."""
     if lanes == 1:
         return [turns]
-    inner: list[Turn] = [turn for turn in turns if turn != "right"]
-    outer: list[Turn] = [turn for turn in turns if turn != "left"]
-    if straight_lanes == 1:  # one lane only may go on; the outer one, unless it is the only one that can turn right
-        keep = inner if "left" not in turns else outer
-        (outer if keep is inner else inner).remove("straight")
-    return [inner, outer]
+    if len(turns) == 2:  # at a T each lane has a use of its own
+        return [turns[:1], turns[1:]]
+    return [["left", "straight"] if straight_lanes == 2 else ["left"], ["straight", "right"]]
 
 
 @cache
@@ -240,24 +237,14 @@ def _junction(arms: tuple[int, int, int, int], reach: float) -> _Junction:
             for turn, to in exits:
                 if turn not in offered[lane]:
                     continue
-                for to_lane in _exit_lanes(turn, lane, lanes, arms[to], bend=bend):
+                beside = bend or (turn == "straight" and lanes == 2 and len(exits) == 3 and arms[to] == 2)
+                # nobody changes lanes on a street: wherever no other lane goes the same way, both can be reached
+                for to_lane in [lane] if beside else range(arms[to]):
                     pieces = _connect(
                         _pose(arm, lane, reach, inbound=True), _pose(to, to_lane, reach, inbound=False), turn
                     )
                     ways.append(_Way(arm, lane, to, to_lane, turn, tuple(pieces)))
     return _Junction(tuple(ways), *_conflicts(ways))
-
-
-def _exit_lanes(turn: Turn, lane: int, lanes: int, to_lanes: int, *, bend: bool) -> list[int]:
-    if bend:
-        return [lane]
-    if turn == "left":
-        return [0]
-    if turn == "right":
-        return [to_lanes - 1]
-    if lanes == to_lanes:
-        return [lane]
-    return list(range(to_lanes)) if lanes == 1 else [0]
 
 
 def _conflicts(ways: list[_Way]) -> tuple[Floats, Floats]:
@@ -370,26 +357,65 @@ def draw_town(settings: TownSettings, rng: np.random.Generator) -> Town:
     xs = np.concatenate([[0.0], np.cumsum(rng.uniform(*settings.block, columns - 1).round(1))])
     ys = np.concatenate([[0.0], np.cumsum(rng.uniform(*settings.block, rows - 1).round(1))])
     streets = _drop_streets(settings, rng)
-    degrees = _degrees(streets, rows * columns)
-    lanes = _lane_counts(streets, degrees, settings.two_lane_share, rng)
-    bends = rng.uniform(*BEND, rows * columns).round(1)
     limits = np.full(len(streets), settings.speed_limit)
     if settings.road_limits:
         limits = rng.choice(np.array(settings.road_limits), len(streets))
+    for _ in range(100):
+        town = _lay_out(settings, streets, limits, (xs, ys), rng)
+        if _all_reachable(town):
+            return town
+    raise BadInputError(
+        f"town: no way was found to give {settings.two_lane_share:.0%} of the streets two lanes (two_lane_share) so "
+        "that every lane leads to every other; take another share, a larger grid or another seed"
+    )
+
+
+def _lay_out(
+    settings: TownSettings,
+    streets: list[tuple[int, int]],
+    limits: Floats,
+    axes: tuple[Floats, Floats],
+    rng: np.random.Generator,
+) -> Town:
+    """A town on these streets, with lanes and bends drawn."""
+    xs, ys = axes
+    nodes, columns = len(xs) * len(ys), len(xs)
+    degrees = _degrees(streets, nodes)
+    lanes = _lane_counts(streets, degrees, settings.two_lane_share, rng)
+    bends = rng.uniform(*BEND, nodes).round(1)
     draft = _Draft(columns, xs, ys)
     for street, limit in zip(streets, limits, strict=True):
         for a, b in (street, street[::-1]):
             draft.arms[a][_arm(a, b, columns)] = lanes[street]
             draft.limits[a][_arm(a, b, columns)] = float(limit) / 3.6
-    for node in range(rows * columns):
+    for node in range(nodes):
         arms = draft.arms[node]
         corner = degrees[node] == 2 and arms[0] != arms[2]
         draft.reach[node] = bends[node] if corner else max(arms) * LANE_WIDTH + CORNER
     for street in streets:
         draft.add_street(*street, lanes[street])
-    for node in range(rows * columns):
+    for node in range(nodes):
         draft.add_junction(node)
     return draft.finish(degrees)
+
+
+def _all_reachable(town: Town) -> bool:
+    """Whether every lane leads to every other: nobody changes lanes, so a ring of turning lanes could be a trap."""
+    ahead = {entry: {town.movements[way].exit for way in ways} for entry, ways in town.ways.items()}
+    behind: dict[int, set[int]] = {entry: set() for entry in ahead}
+    for entry, exits in ahead.items():
+        for exit_ in exits:
+            behind[exit_].add(entry)
+    for links in (ahead, behind):
+        start = next(iter(links))
+        seen, todo = {start}, [start]
+        while todo:
+            new = links[todo.pop()] - seen
+            seen |= new
+            todo += new
+        if len(seen) < len(links):
+            return False
+    return True
 
 
 class _Draft:
