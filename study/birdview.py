@@ -26,9 +26,9 @@ FORMAT_VERSION = 1  # raise it when the same Episode and settings give other pix
 RATE_HZ = 10.0  # of history and future (Sec. III-A)
 MASK_BYTES = IMAGE * IMAGE // 8
 
-SURFACE = (32, 4)  # grey of a lane: the first, and how much lighter for each LIMIT_STEP of its speed limit
-PLAIN_SURFACE = 80  # grey where all lanes have one limit
-LIMIT_STEP, LIMIT_SHADES = 5 / 3.6, 32  # [m/s]
+SURFACE = (16, 8)  # grey of a lane: the first, and how much lighter for each LIMIT_STEP of its speed limit
+PLAIN_SURFACE = 80  # grey where all lanes have one limit, and that of 40 km/h
+LIMIT_STEP, LIMIT_SHADES = 5 / 3.6, 20  # [m/s]; limits of 95 km/h and more look alike
 BOUNDARY, LINE = 176, 255  # greys of curbs and of lane lines
 BOUNDARY_WIDTH, LINE_WIDTH, ROUTE_WIDTH = 0.5, 0.3, 2.0  # [m]
 DASH = 3.0  # [m], length of a dash and of the gap behind it
