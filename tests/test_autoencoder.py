@@ -1,0 +1,495 @@
+"""Encoders: the paper's networks, their losses, and trainings that are repeatable, resumable and clear in failure."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.numpy import load_file, save_file
+from torch import nn
+from torch.nn import functional
+
+from drives import write_drives
+from study import autoencoder
+from study.autoencoder import (
+    Decoder,
+    Encoder,
+    MultiHeadAutoencoder,
+    TrainedEncoder,
+    choose_precision,
+    choose_samples,
+    encode,
+    plan_training,
+    train_encoder,
+    unpack,
+)
+from study.config import (
+    HEAD_SETS,
+    HEADS,
+    IMAGE,
+    LATENT,
+    BadInputError,
+    BirdviewSettings,
+    EncoderSettings,
+    FramesSettings,
+    parameter_counts,
+)
+from study.frames import Frames, build_frames, open_frames, unpack_masks
+from study.result import TrainingDivergedError
+
+FRAMES = FramesSettings(encoder=160, policy=40, spacing=0.3, balance="none")
+SETTINGS = EncoderSettings(epochs=2, batch=32, precision="fp32")
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("frames")
+    encoder, policy = (
+        write_drives(folder, 5, cars=8, steps=60),
+        write_drives(folder, 2, first_seed=50, cars=8, steps=60),
+    )
+    build_frames(FRAMES, BirdviewSettings(), encoder, policy, folder / "store", 1)
+    return folder / "store"
+
+
+@pytest.fixture(scope="module")
+def frames(store: Path) -> Frames:
+    return open_frames(store).encoder
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Any:
+    """Two threads wait actively for each other, which takes ten times as long when other tests run beside."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+class KilledError(Exception):
+    pass
+
+
+def train(
+    frames: Frames,
+    heads: str = "rec+plan",
+    settings: EncoderSettings = SETTINGS,
+    *,
+    fraction: float = 1.0,
+    seed: int = 0,
+    checkpoint: Path | None = None,
+    device: str = "cpu",
+    kill_at: int | None = None,
+    logged: list[tuple[int, dict[str, float]]] | None = None,
+) -> TrainedEncoder:
+    def progress(done: int, total: int) -> None:
+        if done == kill_at:
+            raise KilledError
+
+    return train_encoder(
+        frames,
+        heads,
+        fraction,
+        seed,
+        settings,
+        FRAMES,
+        device=device,
+        checkpoint=checkpoint,
+        log=lambda epoch, losses: None if logged is None else logged.append((epoch, losses)),
+        progress=progress,
+    )
+
+
+def assert_same(one: TrainedEncoder, other: TrainedEncoder) -> None:
+    assert one.curves.equals(other.curves)
+    for name in ("weights", "samples"):
+        ours, theirs = getattr(one, name), getattr(other, name)
+        assert ours.keys() == theirs.keys()
+        for key, value in ours.items():
+            assert np.array_equal(value, theirs[key]), key
+
+
+def images(count: int) -> torch.Tensor:
+    return torch.rand(count, 3, IMAGE, IMAGE, generator=torch.Generator().manual_seed(1))
+
+
+# --- networks -------------------------------------------------------------------------------------------------------
+
+
+def test_learnable_numbers_are_the_papers() -> None:
+    counted = {"encoder": Encoder()} | {head: Decoder(channels) for head, channels in HEADS.items()}
+    learnable = {
+        name: sum(weights.numel() for weights in network.parameters() if weights.requires_grad)
+        for name, network in counted.items()
+    }
+    assert learnable == parameter_counts()
+    assert (learnable["encoder"], learnable["rec"], learnable["plan"]) == (461_024, 474_403, 473_377)
+
+
+def test_every_head_gives_an_image_of_the_inputs_size() -> None:
+    z = Encoder()(images(2))
+    assert z.shape == (2, LATENT)
+    for channels in HEADS.values():
+        assert Decoder(channels)(z).shape == (2, channels, IMAGE, IMAGE)
+
+
+def test_networks_equal_plain_torch_layers_in_output_and_gradient() -> None:
+    """Biases that BatchNorm cancels are left out of the backward pass, which changes no other gradient."""
+    decoder = Decoder(1)
+    plain = [
+        nn.Conv2d(*_shape(layer), 4, 2)
+        if isinstance(layer, nn.Conv2d)
+        else nn.ConvTranspose2d(*_shape(layer), 4, 2, output_padding=layer.output_padding)
+        if isinstance(layer, nn.ConvTranspose2d)
+        else type(layer)(layer.num_features)
+        if isinstance(layer, nn.BatchNorm2d)
+        else nn.ReLU()
+        for layer in decoder.convolutions
+    ]
+    stock = nn.Sequential(*plain, nn.ConvTranspose2d(32, 1, 4, 2))
+    stock.load_state_dict(
+        decoder.convolutions.state_dict() | {f"{len(plain)}.{k}": v for k, v in decoder.output.state_dict().items()}
+    )
+    z = torch.randn(16, LATENT, generator=torch.Generator().manual_seed(0))
+    core = decoder.fully_connected(z).view(-1, 6, 6, 128).permute(0, 3, 1, 2)
+    ours, theirs = decoder(z), stock(core)
+    assert torch.allclose(ours, theirs, atol=1e-5)
+    ours.square().mean().backward()
+    theirs.square().mean().backward()
+    for name, layer in zip(("0", "3"), (stock[0], stock[3]), strict=True):
+        expected = layer.weight.grad
+        got = decoder.convolutions.get_submodule(name)
+        assert torch.allclose(got.weight.grad, expected, rtol=1e-3, atol=1e-6 * float(expected.abs().max()) + 1e-7)
+        assert layer.bias.grad.abs().max() < 1e-4 * expected.abs().max()
+    assert torch.allclose(decoder.output.bias.grad, stock[-1].bias.grad, rtol=1e-4)
+
+
+def _shape(layer: Any) -> tuple[int, int]:
+    return layer.in_channels, layer.out_channels
+
+
+def test_a_seed_gives_every_head_set_the_same_encoder_and_heads() -> None:
+    torch.manual_seed(5)
+    networks = {heads: MultiHeadAutoencoder(heads, SETTINGS, 3).state_dict() for heads in HEAD_SETS}
+    for smaller, larger in itertools.combinations(networks.values(), 2):
+        shared = smaller.keys() & larger.keys()
+        assert any(name.startswith("encoder") for name in shared)
+        assert all(torch.equal(smaller[name], larger[name]) for name in shared)
+    other = MultiHeadAutoencoder("rec", SETTINGS, 4).state_dict()
+    assert not torch.equal(networks["rec"]["encoder.mean.weight"], other["encoder.mean.weight"])
+
+
+def test_initial_weights_are_spread_as_torchs_own() -> None:
+    ours = MultiHeadAutoencoder("full", SETTINGS, 0)
+    for ours_layer, stock_layer in zip(ours.decoders["rec"].modules(), Decoder(3).modules(), strict=True):
+        if isinstance(ours_layer, nn.Linear | nn.ConvTranspose2d):
+            assert float(ours_layer.weight.detach().abs().max()) == pytest.approx(
+                float(stock_layer.weight.detach().abs().max()), rel=0.02
+            )
+
+
+def test_masks_are_unpacked_as_the_frame_store_packs_them(frames: Frames) -> None:
+    masks = np.array(frames.masks[:20])
+    assert masks.any()
+    unpacked = unpack(torch.from_numpy(masks), ["pred", "plan"])
+    expected = unpack_masks(masks)
+    assert np.array_equal(unpacked["pred"].squeeze(1).numpy(), expected[:, 0])
+    assert np.array_equal(unpacked["plan"].squeeze(1).numpy(), expected[:, 1])
+
+
+def test_loss_is_the_weighted_sum_of_cross_entropies(frames: Frames) -> None:
+    settings = EncoderSettings(head_weights={"rec": 2.0, "plan": 0.5})
+    module = MultiHeadAutoencoder("full", settings, 0)
+    batch = torch.tensor(frames.images[:8]), torch.tensor(frames.masks[:8])
+    found = dict(zip(module.metrics, module.losses(*batch).tolist(), strict=True))
+    plan = torch.from_numpy(unpack_masks(frames.masks[:8])[:, 1:]).float()
+    pixels = batch[0].permute(0, 3, 1, 2) / 255
+    with torch.no_grad():
+        outputs = module(pixels)
+    assert found["loss_plan"] == pytest.approx(
+        float(functional.binary_cross_entropy(outputs["plan"].sigmoid(), plan)), rel=1e-4
+    )
+    assert found["loss_rec"] == pytest.approx(
+        float(functional.binary_cross_entropy(outputs["rec"].sigmoid(), pixels)), rel=1e-4
+    )
+    total = 2 * found["loss_rec"] + found["loss_pred"] + 0.5 * found["loss_plan"]
+    assert found["loss"] == pytest.approx(total, rel=1e-5)
+
+
+# --- training -------------------------------------------------------------------------------------------------------
+
+
+def test_each_heads_loss_is_logged_on_both_splits_every_epoch_and_falls(frames: Frames) -> None:
+    logged: list[tuple[int, dict[str, float]]] = []
+    trained = train(frames, "full", logged=logged)
+    assert [epoch for epoch, _ in logged] == [1, 2]
+    for split, metric in itertools.product(("train", "test"), ("loss", "loss_rec", "loss_pred", "loss_plan")):
+        curve = trained.curves.query("split == @split and metric == @metric").sort_values("epoch")["value"].tolist()
+        assert curve == [losses[f"{split}/{metric}"] for _, losses in logged]
+        assert curve[1] < curve[0]
+    assert len(trained.curves) == 2 * 2 * 4
+    assert trained.frames == len(frames.indices("train"))
+
+
+def test_same_seed_same_bytes_whatever_the_global_generators(frames: Frames) -> None:
+    torch.manual_seed(1)
+    one = train(frames)
+    torch.manual_seed(2)
+    assert_same(one, train(frames))
+    assert not np.array_equal(one.weights["mean.weight"], train(frames, seed=1).weights["mean.weight"])
+
+
+def test_bf16_follows_fp32_within_one_percent(frames: Frames) -> None:
+    """Stated tolerance: each epoch's losses differ by less than 1 % of fp32's; latents come from fp32 in both."""
+    settings = SETTINGS.model_copy(update={"epochs": 4})
+    exact = train(frames, "full", settings)
+    fast = train(frames, "full", settings.model_copy(update={"precision": "bf16"}))
+    assert (exact.precision, fast.precision) == ("fp32", "bf16")
+    train_rows = exact.curves["split"] == "train"
+    gap = (fast.curves["value"] / exact.curves["value"] - 1).abs()
+    assert 0 < gap[train_rows].max() < 0.01
+
+
+def test_auto_is_fp32_where_the_processor_has_no_bf16(monkeypatch: pytest.MonkeyPatch) -> None:
+    cpu = torch.device("cpu")
+    for flags, expected in (({"avx2"}, "fp32"), ({"avx512f", "amx_bf16"}, "bf16")):
+        monkeypatch.setattr(autoencoder, "_cpu_flags", lambda flags=flags: flags)
+        assert choose_precision("auto", cpu) == expected
+    assert choose_precision("fp32", cpu) == "fp32"
+
+
+def test_variational_adds_a_layer_and_its_loss(frames: Frames) -> None:
+    plain, variational = train(frames, "rec"), train(frames, "rec", SETTINGS.model_copy(update={"beta": 1.0}))
+    assert variational.weights.keys() - plain.weights.keys() == {"log_variance.weight", "log_variance.bias"}
+    assert "loss_kl" in set(variational.curves["metric"])
+    assert "loss_kl" not in set(plain.curves["metric"])
+    one, again = (encode(variational.weights, frames.images, frames.indices("test")) for _ in range(2))
+    assert np.array_equal(one, again)
+
+
+def test_an_epoch_takes_each_frame_once_in_even_batches(frames: Frames) -> None:
+    settings = SETTINGS.model_copy(update={"batch": 30})
+    plan = plan_training(frames, 1.0, 0, settings, FRAMES)
+    parts = plan.parts(0)
+    assert len(parts) == plan.steps == -(-len(frames.indices("train")) // 30)
+    assert np.array_equal(np.sort(np.concatenate(parts)), frames.indices("train"))
+    sizes = [len(part) for part in parts]
+    assert max(sizes) <= 30
+    assert max(sizes) - min(sizes) <= 1
+    assert not np.array_equal(np.concatenate(parts), np.concatenate(plan.parts(1)))
+
+
+def test_the_step_budget_keeps_the_steps_of_the_whole_data(frames: Frames) -> None:
+    settings = SETTINGS.model_copy(update={"budget": "steps"})
+    whole = plan_training(frames, 1.0, 0, settings, FRAMES)
+    quarter = plan_training(frames, 0.25, 0, settings, FRAMES)
+    assert quarter.steps == whole.steps
+    times = np.unique(np.concatenate(quarter.parts(1)), return_counts=True)
+    assert np.array_equal(times[0], quarter.subset)
+    assert set(times[1]) == {4}
+    literal = plan_training(frames, 0.25, 0, SETTINGS, FRAMES)
+    assert literal.steps == -(-whole.steps // 4)
+    trained = train(frames, "rec", settings, fraction=0.25)
+    assert trained.frames == len(quarter.subset)
+    assert trained.curves["epoch"].max() == settings.epochs
+
+
+def test_data_on_a_device_give_the_batches_of_the_mapped_files(frames: Frames) -> None:
+    parts = plan_training(frames, 1.0, 0, SETTINGS, FRAMES).parts(0)
+    mapped = autoencoder._Batches(frames.images, frames.masks, parts)
+    resident = autoencoder._Batches(torch.tensor(frames.images), torch.tensor(frames.masks), parts)
+    for one, other in zip(mapped, resident, strict=True):
+        assert all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
+
+
+# --- going on -------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def every_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(autoencoder, "CHECKPOINT_SECONDS", 0)
+    monkeypatch.setattr(autoencoder, "PROGRESS_SECONDS", 0)
+
+
+@pytest.mark.usefixtures("every_step")
+@pytest.mark.parametrize("beta", [0.0, 0.5])
+def test_a_killed_training_ends_as_one_that_was_never_killed(frames: Frames, tmp_path: Path, beta: float) -> None:
+    """KilledError inside the first epoch, at its last step, and inside the second: the same bytes in the end."""
+    settings = EncoderSettings(epochs=2, batch=32, beta=beta, precision="auto")
+    expected = train(frames, settings=settings)
+    for number, kills in enumerate(((3,), (4, 5, 7))):
+        checkpoint = tmp_path / str(number)
+        for kill in kills:
+            with pytest.raises(KilledError):
+                train(frames, settings=settings, checkpoint=checkpoint, kill_at=kill)
+        logged: list[tuple[int, dict[str, float]]] = []
+        assert_same(expected, train(frames, settings=settings, checkpoint=checkpoint, logged=logged))
+        assert [epoch for epoch, _ in logged] == [1, 2]
+        assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
+
+
+@pytest.mark.usefixtures("every_step")
+def test_a_finished_training_is_not_done_again(frames: Frames, tmp_path: Path) -> None:
+    first = train(frames, checkpoint=tmp_path / "done")
+    assert_same(first, train(frames, checkpoint=tmp_path / "done", kill_at=1))
+
+
+@pytest.mark.usefixtures("every_step")
+def test_a_checkpoint_of_another_configuration_is_refused(frames: Frames, tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint"
+    train(frames, "rec", checkpoint=path)
+    for name, changed in (
+        ("heads", {"heads": "full"}),
+        ("encoder_seed", {"seed": 1}),
+        ("lr", {"settings": SETTINGS.model_copy(update={"lr": 1e-3})}),
+        ("fraction", {"fraction": 0.5}),
+    ):
+        with pytest.raises(BadInputError, match=f"another configuration: {name} "):
+            train(frames, **({"heads": "rec"} | changed), checkpoint=path)
+    other = replace(frames, images=np.asarray(frames.images) ^ 1)
+    with pytest.raises(BadInputError, match="frames is"):
+        train(other, "rec", checkpoint=path)
+
+
+def test_a_broken_checkpoint_is_refused(frames: Frames, tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint"
+    train(frames, "rec", checkpoint=path)
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(BadInputError, match="no checkpoint of an encoder"):
+        train(frames, "rec", checkpoint=path)
+
+
+@pytest.mark.slow
+def test_a_training_that_was_really_killed_goes_on(store: Path, frames: Frames, tmp_path: Path) -> None:
+    """SIGKILL at a random moment after the first checkpoint, in a process of its own."""
+    checkpoint = tmp_path / "checkpoint"
+    program = f"""
+import torch
+from pathlib import Path
+from study import autoencoder
+from study.config import EncoderSettings, FramesSettings
+from study.frames import open_frames
+torch.set_num_threads(1)
+autoencoder.CHECKPOINT_SECONDS = 0
+autoencoder.train_encoder(
+    open_frames(Path({str(store)!r})).encoder, "rec", 1.0, 0, EncoderSettings(epochs=12, batch=16),
+    FramesSettings.model_validate_json({FRAMES.model_dump_json()!r}), device="cpu",
+    checkpoint=Path({str(checkpoint)!r}), log=lambda epoch, losses: print(epoch, flush=True),
+)
+"""
+    process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    for line in process.stdout:
+        if int(line) == 3:
+            process.kill()
+            break
+    assert process.wait() == -signal.SIGKILL
+    settings = EncoderSettings(epochs=12, batch=16)
+    assert_same(train(frames, "rec", settings), train(frames, "rec", settings, checkpoint=checkpoint))
+
+
+# --- bad input and bad luck -----------------------------------------------------------------------------------------
+
+
+def test_a_loss_that_is_not_finite_names_epoch_and_step(frames: Frames, tmp_path: Path) -> None:
+    settings = EncoderSettings(epochs=2, batch=32, lr=1e30, precision="fp32")
+    with pytest.raises(TrainingDivergedError, match="epoch 1, step 2;"):
+        train(frames, "rec", settings, checkpoint=tmp_path / "checkpoint")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_cannot_be_used_is_refused_with_the_way_out(frames: Frames) -> None:
+    with pytest.raises(BadInputError, match=r"unknown head set 'rec[+]plam'; choose from rec, rec"):
+        train(frames, "rec+plam")
+    with pytest.raises(BadInputError, match=r"batch 500 is larger than the 128 training frames.*--encoder.batch"):
+        train(frames, "rec", EncoderSettings(batch=500))
+    for device in ("cuda:99", "mps"):
+        with pytest.raises(BadInputError, match=f"device '{device}' is not on this machine; choose from cpu"):
+            train(frames, "rec", device=device)
+    with pytest.raises(BadInputError, match="unknown device 'gpu'"):
+        train(frames, "rec", device="gpu")
+
+
+@pytest.mark.usefixtures("every_step")
+def test_ctrl_c_and_sigterm_keep_their_meaning(frames: Frames) -> None:
+    """Lightning would turn the one into exit code 1 and delay the other to the end of the epoch."""
+
+    def stop(number: int) -> None:
+        train_encoder(
+            frames,
+            "rec",
+            1.0,
+            0,
+            SETTINGS,
+            FRAMES,
+            device="cpu",
+            checkpoint=None,
+            log=lambda epoch, losses: pytest.fail("an epoch went on"),
+            progress=lambda done, total: os.kill(os.getpid(), number),
+        )
+
+    with pytest.raises(KeyboardInterrupt):
+        stop(signal.SIGINT)
+
+    def terminate(*_: object) -> None:
+        raise KilledError
+
+    before = signal.signal(signal.SIGTERM, terminate)
+    try:
+        with pytest.raises(KilledError):
+            stop(signal.SIGTERM)
+        assert signal.getsignal(signal.SIGTERM) is terminate
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+# --- what is kept ---------------------------------------------------------------------------------------------------
+
+
+def test_latents_depend_on_neither_batch_nor_order(frames: Frames, tmp_path: Path) -> None:
+    """And weights may have been saved and loaded in between."""
+    weights = train(frames, "rec").weights
+    save_file({name: np.ascontiguousarray(value) for name, value in weights.items()}, tmp_path / "weights")
+    indices = frames.indices("test")
+    z = encode(weights, frames.images, indices)
+    assert z.shape == (len(indices), LATENT)
+    assert z.dtype == np.float32
+    again = encode(load_file(tmp_path / "weights"), frames.images, indices[::-1], batch=7)
+    assert np.allclose(z, again[::-1], atol=1e-4)
+    assert z.std(axis=0).min() > 0
+
+
+def test_foreign_weights_are_refused(frames: Frames) -> None:
+    with pytest.raises(BadInputError, match="not the weights of an encoder"):
+        encode({"policy.weight": np.zeros((3, 3), np.float32)}, frames.images, frames.indices("test"))
+
+
+def test_samples_are_the_same_rich_test_frames_for_every_encoder(frames: Frames) -> None:
+    rows = choose_samples(frames)
+    test = frames.indices("test")
+    assert len(rows) == len(set(rows.tolist())) == 16
+    assert set(rows) <= set(test)
+    assert frames.labels["episode"][rows].nunique() == frames.labels["episode"][test].nunique()
+    masks = unpack_masks(frames.masks[:])
+    assert masks[rows].mean() > masks[test].mean()
+    samples = train(frames, "full").samples
+    assert np.array_equal(samples["input"], frames.images[rows])
+    assert np.array_equal(samples["plan_target"], masks[rows][:, 1] * 255)
+    assert {name: value.shape[1:] for name, value in samples.items()} == {
+        "input": (64, 64, 3),
+        "rec_output": (64, 64, 3),
+        "pred_output": (64, 64),
+        "plan_output": (64, 64),
+        "pred_target": (64, 64),
+        "plan_target": (64, 64),
+    }
+    assert all(value.dtype == np.uint8 for value in samples.values())
