@@ -386,13 +386,13 @@ autoencoder.train_encoder(
     checkpoint=Path({str(checkpoint)!r}), log=lambda epoch, losses: print(epoch, flush=True),
 )
 """
-    process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    for line in process.stdout:
-        if int(line) == 3:
-            process.kill()
-            break
-    assert process.wait() == -signal.SIGKILL
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if int(line) == 3:
+                process.kill()
+                break
+    assert process.returncode == -signal.SIGKILL
     settings = EncoderSettings(epochs=12, batch=16)
     assert_same(train(frames, "rec", settings), train(frames, "rec", settings, checkpoint=checkpoint))
 
