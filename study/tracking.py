@@ -17,6 +17,7 @@ import json
 import math
 import os
 import re
+import shutil
 import sqlite3
 import tempfile
 import threading
@@ -64,6 +65,7 @@ FLUSH = 2.0  # [s] between two writes of live curves
 RESULT = "result"  # artifact folder of a cell run
 RESULT_FILES = (*(f"{part}.safetensors" for part in ARRAYS), "curves.parquet", "cell.json")
 PLAN_VERSION = 1
+BESIDE = "artifacts_beside_database"  # tag of an experiment whose artifacts move with its database
 VALUE_LIMIT = 4000  # characters of a parameter or tag; MLflow takes 6000 and 8000, its databases 8000
 PARENT, COMMIT, NOTE = "mlflow.parentRunId", "mlflow.source.git.commit", "mlflow.note.content"
 # Columns [pixels] of the view of all cells that MLflow's pages open with `?viewStateShareKey=cells`.
@@ -180,7 +182,7 @@ class Tracker:
         found = self.client.get_experiment_by_name(name)
         if found is None:
             with suppress(MlflowException):  # another process was faster, or the next line says what is wrong
-                self.client.create_experiment(name, str(folder) if folder else None)
+                self.client.create_experiment(name, str(folder) if folder else None, {BESIDE: "true"})
             found = self.client.get_experiment_by_name(name)
         if found is None or found.lifecycle_stage != "active":
             raise BadInputError(
@@ -196,9 +198,9 @@ class Tracker:
 
     def _follow(self, path: Path, folder: Path) -> None:
         """Let the database point to the artifacts beside it: MLflow stores whole paths, and folders are moved."""
-        old = str(self.client.get_experiment(self.experiment).artifact_location)
-        new = str(folder)
-        if old == new or not old.startswith("/") or not old.endswith("/artifacts") or not folder.is_dir():
+        found = self.client.get_experiment(self.experiment)
+        old, new = str(found.artifact_location), str(folder)
+        if old == new or BESIDE not in found.tags:  # without it, someone keeps them elsewhere on purpose
             return
         with sqlite3.connect(path, timeout=20) as database:
             database.execute(
@@ -275,7 +277,7 @@ class Tracker:
                 if created != run_id:  # a server has no lock: of two parents started at once, both take the first
                     self.client.delete_run(created)
             for run in sweeps:
-                # A database file belongs to one machine, where one sweep runs at a time: others that say so were killed.
+                # A database file belongs to one machine, where one sweep runs at a time: others were killed.
                 if self._lock and run.info.status == "RUNNING" and run.info.run_id != run_id:
                     self._close_cells(run.info.run_id)
                     self._close(run.info.run_id, "KILLED", {"reason": "another sweep was started"})
@@ -388,7 +390,8 @@ class Tracker:
                 "sweep": sweep.info.run_name,
                 PARENT: sweep_run_id,
             }
-            run_id = self._create(cell.label, tags)
+            started = time.time_ns() // 1_000_000
+            run_id = self._create(cell.label, tags, started)
             for run in before:
                 if run.info.status == "RUNNING":
                     self._close(run.info.run_id, "KILLED", {"superseded_by": run_id})
@@ -398,7 +401,6 @@ class Tracker:
             self.client.log_batch(run_id, params=_params(params))
             if sweep.inputs.dataset_inputs:
                 self.client.log_inputs(run_id, datasets=sweep.inputs.dataset_inputs)
-            started = self.client.get_run(run_id).info.start_time
         return CellRun(run_id, key, cell, started, self.client)
 
     def commit(self, cell_run: CellRun, result: CellResult) -> str:
@@ -698,10 +700,13 @@ def _prepare_file(path: Path, artifacts: Path, lock: Path, shown: str) -> None:
             # MLflow needs seconds for its tables; a process killed in between would leave a database half made.
             with _alone(lock):
                 if not path.exists():
-                    draft = path.with_name(f".{path.name}.draft")
-                    draft.unlink(missing_ok=True)
+                    drafts = path.with_name(f".{path.name}.draft")  # a folder, since SQLite writes a journal beside
+                    shutil.rmtree(drafts, ignore_errors=True)
+                    drafts.mkdir()
+                    draft = drafts / path.name
                     SqlAlchemyStore(f"{SQLITE}{draft}", str(artifacts))._dispose_engine()  # noqa: SLF001 - closes it
                     draft.replace(path)
+                    shutil.rmtree(drafts)
             return
         with sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True, timeout=20) as database:
             tables = {row[0] for row in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}

@@ -308,7 +308,7 @@ def test_an_interrupted_cell_does_not_stay_running(tracker):
 
 
 def test_a_sweep_is_read_back_from_the_store_alone(tracker, uri):
-    planned = cells("read")
+    planned = dict(reversed(cells("read").items()))  # the order of the plan is kept, not that of the keys
     sweep = open_sweep(tracker, planned)
     for number, key in enumerate(planned):
         train(tracker, sweep, planned, key, seed=number)
@@ -319,7 +319,7 @@ def test_a_sweep_is_read_back_from_the_store_alone(tracker, uri):
     assert record.complete
     assert record.data == DATA
     assert record.provenance == ORIGIN
-    assert list(record.table()["heads"].unique()) == ["rec", "full"]
+    assert list(record.table()["heads"].unique()) == ["full", "rec"]
     assert tracker.client.get_run(sweep).data.tags["cells"] == "2 of 2 finished"
 
 
@@ -457,8 +457,19 @@ def test_a_moved_store_keeps_its_artifacts(tmp_path):
     assert not old.exists()
 
 
+def test_artifacts_that_are_kept_elsewhere_on_purpose_stay_there(uri, tmp_path):
+    Tracker(uri).client.create_experiment("elsewhere", str(tmp_path / "artifacts"))
+    planned = cells("elsewhere")
+    for number in range(2):  # opened anew
+        tracker = Tracker(uri, experiment="elsewhere")
+        train(tracker, open_sweep(tracker, planned), planned, f"elsewhere-{number}")
+    assert tracker.read_sweep("heads").complete
+    assert (tmp_path / "artifacts").is_dir()
+
+
 def test_a_database_whose_making_was_cut_short_is_made_again(tmp_path):
-    (tmp_path / ".mlflow.db.draft").write_bytes(b"half")
+    (tmp_path / ".mlflow.db.draft").mkdir()
+    (tmp_path / ".mlflow.db.draft" / "mlflow.db").write_bytes(b"half")
     Tracker(f"{SQLITE}{tmp_path}/mlflow.db")
     assert not (tmp_path / ".mlflow.db.draft").exists()
 
