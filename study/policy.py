@@ -56,8 +56,9 @@ METRICS = ("steering_loss", "acceleration_accuracy", "balanced_accuracy", "cross
 SPLITS = ("train", "test")
 
 _INIT, _EPOCH, _SUBSET = range(3)  # purposes of random numbers
-_WORD = 32  # mask bits in a word
-_BIT = 0x40000000  # the one bit that makes an int32 the float32 2.0
+_WORD = 16  # random bits in an int16
+_TWO = 30  # the one bit that makes an int32 the float32 2.0
+_VECTOR = 16  # float32 in the widest register
 _DROPPED = -1e30  # takes a unit below zero, where the ReLU ends it
 _KEPT = 1 / (1 - DROPOUT)
 _ROWS = 2048  # evaluated at once: their hidden units fit into a core's cache
@@ -110,7 +111,7 @@ def normalise(weights: Mapping[str, NDArray[Any]], z: NDArray[np.float32]) -> ND
 
 
 class Draws(NamedTuple):
-    """All chance of one epoch: `order` [S, N] int64 and, for each hidden layer, mask bits [S, N * H / 32] int32."""
+    """All chance of one epoch: `order` [S, N] int64 and, for each hidden layer, bits [S, N * H / 16] int16."""
 
     order: Tensor
     bits: dict[str, tuple[Tensor, Tensor]]
@@ -124,27 +125,64 @@ def draw_epoch(seeds: Sequence[int], epoch: int, frames: int) -> Draws:
     words = {name: tuple(width // _WORD for width in widths[1:-1]) for name, widths in WIDTHS.items()}
     ends = np.cumsum([0, *(frames * each for layers in words.values() for each in layers)])
     order = np.empty((len(seeds), frames), np.int64)
-    bits = np.empty((len(seeds), ends[-1]), np.int32)
+    bits = np.empty((len(seeds), ends[-1]), np.int16)
     for row, seed in enumerate(seeds):
         rng = np.random.Generator(np.random.SFC64([seed, _EPOCH, epoch]))
         order[row] = rng.permutation(frames)
-        bits[row] = rng.bit_generator.random_raw(math.ceil(ends[-1] / 2)).view(np.int32)[: ends[-1]]
+        bits[row] = rng.bit_generator.random_raw(math.ceil(ends[-1] / 4)).view(np.int16)[: ends[-1]]
     parts = iter([torch.from_numpy(bits[:, a:b]) for a, b in itertools.pairwise(ends)])
     return Draws(torch.from_numpy(order), {name: (next(parts), next(parts)) for name in WIDTHS})
 
 
-def _initial(seed: int) -> Iterator[tuple[str, Tensor]]:
-    """Weights as torch's Linear draws them: uniform within 1 / sqrt(inputs)."""
+def initial_weights(seed: int) -> Iterator[tuple[str, Tensor]]:
+    """One policy's weights by name, as torch's Linear draws them: uniform within 1 / sqrt(inputs)."""
     rng = np.random.default_rng([seed, _INIT])
     for name, widths in WIDTHS.items():
-        for layer, (inputs, outputs) in enumerate(itertools.pairwise(widths)):
-            bound = inputs**-0.5
-            for part, shape in (("weight", (inputs, outputs)), ("bias", (outputs,))):
-                values = rng.uniform(-bound, bound, shape).astype(np.float32)
-                yield f"{name}_{layer}_{part}", torch.from_numpy(values)
+        for slot in slots(name):
+            bound = widths[slot.layer] ** -0.5
+            yield slot.key, torch.from_numpy(rng.uniform(-bound, bound, slot.shape).astype(np.float32))
 
 
 # --- the networks ---------------------------------------------------------------------------------------------------
+
+
+class Slot(NamedTuple):
+    """Where one weight or bias lies in the row of numbers that is one network of one seed."""
+
+    key: str
+    layer: int
+    start: int
+    shape: tuple[int, ...]
+
+    def cut(self, rows: Tensor) -> Tensor:
+        """This weight [G, in, out] or bias [G, out] of rows [G, numbers], without a copy."""
+        return rows[:, self.start : self.start + math.prod(self.shape)].view(-1, *self.shape)
+
+
+def slots(name: str) -> list[Slot]:
+    """Weights and biases of a network in their order, layer by layer."""
+    found, start = [], 0
+    for layer, (inputs, outputs) in enumerate(itertools.pairwise(WIDTHS[name])):
+        for part, shape in (("weight", (inputs, outputs)), ("bias", (outputs,))):
+            found.append(Slot(f"{name}_{layer}_{part}", layer, start, shape))
+            start += math.prod(shape)
+    return found
+
+
+def stack(seeds: Sequence[int], name: str) -> Tensor:
+    """Initial weights of all seeds, [S, numbers]: a row for each, padded to whole vectors of the processor.
+
+    Adam would round the numbers of a last, half-filled vector differently, and a seed's result would depend on where it
+    stands in the stack.
+    """
+    places = slots(name)
+    used = places[-1].start + math.prod(places[-1].shape)
+    rows = torch.zeros(len(seeds), math.ceil(used / _VECTOR) * _VECTOR)
+    for row, seed in enumerate(seeds):
+        start = dict(initial_weights(seed))
+        for slot in places:
+            slot.cut(rows[row : row + 1]).copy_(start[slot.key][None])
+    return rows
 
 
 class Layer(NamedTuple):
@@ -156,10 +194,10 @@ class Layer(NamedTuple):
     bias_gradient: Tensor
 
 
-def dropout_mask(words: Tensor, rows: int) -> Tensor:
-    """Words of 32 random bits [G, B * H / 32] as float32 [G, B, H]: 2.0 where the bit is set, 0.0 where not."""
-    shifts = torch.arange(_WORD, dtype=torch.int32, device=words.device)[:, None]
-    bits = torch.bitwise_left_shift(words[:, None], shifts).bitwise_and_(_BIT)
+def dropped(words: Tensor, rows: int) -> Tensor:
+    """Words of 16 random bits [G, B * H / 16] int16 as float32 [G, B, H]: 2.0 where the bit is set, 0.0 where not."""
+    shifts = torch.arange(_TWO + 1 - _WORD, _TWO + 1, dtype=torch.int32, device=words.device)[:, None]
+    bits = torch.bitwise_left_shift(words.to(torch.int32)[:, None], shifts).bitwise_and_(1 << _TWO)
     return bits.view(torch.float32).view(len(words), rows, -1)
 
 
@@ -177,7 +215,7 @@ def forward_backward(
     """
     activations = [x]
     for depth, (layer, bits) in enumerate(zip(layers[:-1], words, strict=True)):
-        hidden = dropout_mask(bits, x.shape[1])
+        hidden = dropped(bits, x.shape[1])
         hidden.baddbmm_(activations[-1], layer.weight, beta=_DROPPED, alpha=_KEPT if depth else 1)
         activations.append(hidden.add_(layer.bias).relu_())
     outputs = torch.baddbmm(layers[-1].bias, activations[-1], layers[-1].weight, alpha=_KEPT)
@@ -210,15 +248,15 @@ def predict(weights: Mapping[str, NDArray[Any]], z: NDArray[np.float32]) -> tupl
     results = {}
     with torch.inference_mode():
         for name, widths in WIDTHS.items():
-            stack = [
+            layers = [
                 (
                     torch.from_numpy(weights[f"{name}_{layer}_weight"]),
                     torch.from_numpy(weights[f"{name}_{layer}_bias"])[:, None],
                 )
                 for layer in range(len(widths) - 1)
             ]
-            seeds = range(len(stack[0][0]))
-            results[name] = torch.cat([outputs([(w[s : s + 1], b[s : s + 1]) for w, b in stack], x) for s in seeds])
+            seeds = range(len(layers[0][0]))
+            results[name] = torch.cat([outputs([(w[s : s + 1], b[s : s + 1]) for w, b in layers], x) for s in seeds])
     return results["steering"][..., 0].numpy(), results["acceleration"].numpy()
 
 
@@ -296,9 +334,9 @@ class PolicyData:
 
 
 class PolicyEnsemble(lightning.LightningModule):
-    """S policies as stacked tensors: weights [S, in, out], biases [S, out], gradients written by hand.
+    """S policies as stacked tensors: for each network a row of numbers a seed, and its layers as views of the rows.
 
-    One training step is one batch of every seed. `measured` holds METRICS after each epoch: [epoch][split][4, S].
+    One training step is one batch of every seed. `after_epoch(epoch, {split: METRICS [4, S]})` hears of each epoch.
     """
 
     def __init__(
@@ -313,8 +351,7 @@ class PolicyEnsemble(lightning.LightningModule):
         self.automatic_optimization = False
         self.seeds, self.settings = tuple(seeds), settings
         self._data, self._crew, self._after_epoch = data, crew, after_epoch
-        for stacked in zip(*(_initial(seed) for seed in seeds), strict=True):
-            self.register_parameter(stacked[0][0], nn.Parameter(torch.stack([values for _, values in stacked])))
+        self.stacks = nn.ParameterDict({name: nn.Parameter(stack(seeds, name)) for name in WIDTHS})
         each = [slice(row, row + 1) for row in range(len(self.seeds))]
         self._groups = each if crew else [slice(0, len(self.seeds))]
 
@@ -323,19 +360,27 @@ class PolicyEnsemble(lightning.LightningModule):
         return torch.optim.Adam(self.parameters(), lr=self.settings.lr, fused=True)
 
     def on_train_start(self) -> None:
-        """Cut the stack into groups, once: the layers are views of weights and gradients, which stay where they are."""
-        for parameter in self.parameters():
-            parameter.grad = torch.zeros_like(parameter)
-        self._layers = {
-            name: [[self._layer(name, layer, group) for layer in range(len(widths) - 1)] for group in self._groups]
-            for name, widths in WIDTHS.items()
-        }
+        """Cut the stacks into layers, once: views of weights and of gradients that stay where they are."""
+        self._layers = {name: [self._cut(name, group) for group in self._groups] for name in WIDTHS}
 
-    def _layer(self, name: str, layer: int, group: slice) -> Layer:
-        weight, bias = (self.get_parameter(f"{name}_{layer}_{part}") for part in ("weight", "bias"))
-        assert weight.grad is not None
-        assert bias.grad is not None
-        return Layer(weight.detach()[group], bias.detach()[group, None], weight.grad[group], bias.grad[group, None])
+    def _cut(self, name: str, group: slice) -> list[Layer]:
+        weights = self.stacks[name]
+        if weights.grad is None:
+            weights.grad = torch.zeros_like(weights)
+        rows, gradients = weights.detach()[group], weights.grad[group]
+        places = slots(name)
+        return [
+            Layer(weight.cut(rows), bias.cut(rows)[:, None], weight.cut(gradients), bias.cut(gradients)[:, None])
+            for weight, bias in zip(places[::2], places[1::2], strict=True)
+        ]
+
+    def weights(self) -> Arrays:
+        """Weights [S, in, out] and biases [S, out] by name."""
+        return {
+            slot.key: np.ascontiguousarray(slot.cut(self.stacks[name].detach()).cpu().numpy())
+            for name in WIDTHS
+            for slot in slots(name)
+        }
 
     def on_train_epoch_start(self) -> None:
         """Draw all chance of the epoch, and bring the labels into its order."""
@@ -377,8 +422,8 @@ class PolicyEnsemble(lightning.LightningModule):
         results = {name: x.new_empty((len(self.seeds), len(x), widths[-1])) for name, widths in WIDTHS.items()}
 
         def fill(name: str, index: int) -> None:
-            stack = [(layer.weight, layer.bias) for layer in self._layers[name][index]]
-            results[name][self._groups[index]] = outputs(stack, x)
+            layers = [(layer.weight, layer.bias) for layer in self._layers[name][index]]
+            results[name][self._groups[index]] = outputs(layers, x)
 
         self._share_out(fill)
         return results["steering"][..., 0], results["acceleration"]
@@ -457,7 +502,7 @@ def train_policies(
         _fit(ensemble, settings, math.ceil(len(z_train) / settings.batch), device)
         steering, logits = ensemble.outputs(data.views["test"][0])
     return TrainedPolicies(
-        weights={name: values.detach().cpu().numpy() for name, values in ensemble.named_parameters()} | scaling,
+        weights=ensemble.weights() | scaling,
         curves=pd.concat(points, ignore_index=True)[list(CURVE_COLUMNS)],
         acceleration=logits.argmax(2).to(torch.uint8).cpu().numpy(),
         steering=steering.cpu().numpy(),
