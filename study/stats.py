@@ -377,20 +377,24 @@ def transient(baseline: pd.DataFrame, share: float = 0.95) -> int:
 
 
 def spread_ratio(first: pd.DataFrame, second: pd.DataFrame, epochs: int, level: float = LEVEL) -> Estimate:
-    """Ratio of the variances over policy seeds of one encoder, each a mean over the first epochs and the encoders.
+    """Ratio of the variances over policy seeds of one encoder, each a mean over the first epochs.
 
-    BCa interval over policy seeds, resampled together in both.
+    With one encoder a BCa interval over policy seeds, resampled together in both; with several the geometric mean over
+    encoders of each one's ratio, and a t interval over them.
     """
     both = first.index.intersection(second.index)
     a, b = (_by_policy(frame.loc[both].iloc[:, :epochs]) for frame in (first, second))
-    seeds = a.shape[1]
-    if seeds < 3:
-        return Estimate(math.nan, math.nan, math.nan, seeds, "no interval from fewer than three seeds", level)
-    rng = generator("spread")
-    draws = rng.multinomial(seeds, np.full(seeds, 1 / seeds), size=DRAWS // 5).astype(np.float64)
+    count, seeds = a.shape[:2]
+    if seeds < (2 if count > 1 else 3):
+        return Estimate(math.nan, math.nan, math.nan, seeds, "no interval from so few policies on an encoder", level)
+    ratios = _log_ratio(a, b, np.ones((1, seeds)))[:, 0]
+    whole = float(ratios.mean())
+    if count > 1:
+        low, high = (float(end) for end in t_limits(ratios, level))
+        return Estimate(math.exp(whole), math.exp(low), math.exp(high), count, "t, over encoder seeds", level)
+    draws = generator("spread").multinomial(seeds, np.full(seeds, 1 / seeds), size=DRAWS // 5).astype(np.float64)
     left_out = 1.0 - np.eye(seeds)
-    whole = float(_log_ratio(a, b, np.ones((1, seeds)))[0])
-    low, high = bca_limits(whole, _log_ratio(a, b, draws), _log_ratio(a, b, left_out), level)
+    low, high = bca_limits(whole, _log_ratio(a, b, draws)[0], _log_ratio(a, b, left_out)[0], level)
     return Estimate(math.exp(whole), math.exp(low), math.exp(high), seeds, "BCa bootstrap, over policy seeds", level)
 
 
@@ -404,12 +408,14 @@ def _by_policy(frame: pd.DataFrame) -> Array:
 
 
 def _log_ratio(first: Array, second: Array, counts: Array) -> Array:
+    """Log ratio of variances for each encoder and each row of counts of its policies: [encoders, draws]."""
+
     def variance(values: Array) -> Array:
         share = counts / counts.sum(axis=1, keepdims=True)
         centred = values - values.mean(axis=1, keepdims=True)
-        mean = np.einsum("ds,est->det", share, centred)
-        square = np.einsum("ds,est->det", share, centred**2)
-        return np.asarray((square - mean**2).mean(axis=(1, 2)))
+        mean = np.einsum("ds,est->edt", share, centred)
+        square = np.einsum("ds,est->edt", share, centred**2)
+        return np.asarray((square - mean**2).mean(axis=2))
 
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(np.log(variance(first)) - np.log(variance(second)))

@@ -27,6 +27,7 @@ class World:
         default_factory=lambda: {"rec": 0.03, "rec+pred": 0.016, "rec+plan": 0.012, "full": 0.012}
     )
     by_fraction: float = 0.01  # accuracy lost for each halving of the data, rec; the others lose half of it
+    slower: float = 0.25  # share by which learning is slower for each halving of the data
     steering: float = 0.0011
     steering_effect: float = 0.0
     encoder_sd: float = 0.0
@@ -40,6 +41,7 @@ NULL = World(
     time=dict.fromkeys(HEAD_SETS, 28.0),
     spread=dict.fromkeys(HEAD_SETS, 0.02),
     by_fraction=0.0,
+    slower=0.0,
     encoder_sd=0.0035,
 )
 
@@ -75,7 +77,7 @@ def policy_curves(cell, world, seeds, rng):
     halvings = -np.log2(cell.fraction) * (1.0 if cell.heads == "rec" else 0.5)
     final = world.accuracy[cell.heads] - world.by_fraction * halvings + rng.normal(0, world.encoder_sd)
     epoch = np.arange(1, world.epochs + 1)
-    shape = np.exp(-epoch / (world.time[cell.heads] * (1 + 0.25 * halvings)))
+    shape = np.exp(-epoch / (world.time[cell.heads] * (1 + world.slower * halvings)))
     own = rng.normal(0, world.policy_sd, (seeds, 1)) + rng.normal(0, world.spread[cell.heads], (seeds, 1)) * shape
     test = final - 0.3 * shape + own + rng.normal(0, world.epoch_sd, (seeds, world.epochs))
     loss = world.steering * (1 + 2 * shape) + world.steering_effect * (cell.heads != "rec")
