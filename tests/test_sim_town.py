@@ -1,5 +1,7 @@
 """The drawn town: its streets, junctions, right of way and lights."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -55,7 +57,7 @@ def test_movements_join_their_streets_without_a_gap_or_a_kink(seed: int) -> None
     town = town_of(seed)
     for movement in town.movements:
         chain = [town.strips[k].piece for k in (movement.entry, *movement.strips, movement.exit)]
-        for one, other in zip(chain, chain[1:], strict=False):
+        for one, other in itertools.pairwise(chain):
             x, y, heading = one.end()
             assert np.hypot(x - other.x, y - other.y) < 1e-6
             assert abs((heading - other.heading + np.pi) % (2 * np.pi) - np.pi) < 1e-6
@@ -98,7 +100,7 @@ def test_two_way_streets_keep_right() -> None:
         back = by_index.get((end.replace("<", ">"), start.replace(">", "<"), lane))
         if back is None or "." in start + end or lane:
             continue
-        x, y, heading = back.end()
+        x, y, _heading = back.end()
         side = -(x - piece.x) * np.sin(piece.heading) + (y - piece.y) * np.cos(piece.heading)
         assert side == pytest.approx(-LANE_WIDTH)  # the way back lies to the left
 
@@ -134,7 +136,7 @@ def test_every_light_goes_green_yellow_red_for_its_times() -> None:
         changes = np.flatnonzero(np.diff(light))
         runs = np.diff(changes)
         after = light[changes[:-1] + 1]
-        assert [(a, b) for a, b in zip(after, after[1:], strict=False) if (a + 1) % 3 != b] == []
+        assert [(a, b) for a, b in itertools.pairwise(after) if (a + 1) % 3 != b] == []
         assert set(runs[after == GREEN]) == {round(settings.green / 0.1)}
         assert set(runs[after == YELLOW]) == {round(settings.yellow / 0.1)}
 
