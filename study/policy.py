@@ -15,6 +15,7 @@ import itertools
 import logging
 import math
 import queue
+import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -194,10 +195,27 @@ class Layer(NamedTuple):
     bias_gradient: Tensor
 
 
-def dropped(words: Tensor, rows: int) -> Tensor:
+class Scratch(threading.local):
+    """Memory of one thread that every pass uses again: fresh pages from the system cost as much as the products do."""
+
+    def __init__(self) -> None:
+        self._kept: dict[tuple[str, torch.dtype], Tensor] = {}
+
+    def take(self, use: str, shape: tuple[int, ...], like: Tensor) -> Tensor:
+        """A tensor of that shape, with anything in it; the last one for the same use is lost."""
+        size, key = math.prod(shape), (use, like.dtype)
+        kept = self._kept.get(key)
+        if kept is None or kept.numel() < size:
+            kept = self._kept[key] = torch.empty(size, dtype=like.dtype, device=like.device)
+        return kept[:size].view(shape)
+
+
+def dropped(words: Tensor, rows: int, scratch: Scratch, use: str = "dropped") -> Tensor:
     """Words of 16 random bits [G, B * H / 16] int16 as float32 [G, B, H]: 2.0 where the bit is set, 0.0 where not."""
+    words = words.to(torch.int32)
     shifts = torch.arange(_TWO + 1 - _WORD, _TWO + 1, dtype=torch.int32, device=words.device)[:, None]
-    bits = torch.bitwise_left_shift(words.to(torch.int32)[:, None], shifts).bitwise_and_(1 << _TWO)
+    bits = scratch.take(use, (len(words), _WORD, words.shape[1]), words)
+    torch.bitwise_left_shift(words[:, None], shifts, out=bits).bitwise_and_(1 << _TWO)
     return bits.view(torch.float32).view(len(words), rows, -1)
 
 
@@ -206,16 +224,18 @@ def forward_backward(
     x: Tensor,
     words: Sequence[Tensor],
     output_gradient: Callable[[Tensor], Tensor],
+    scratch: Scratch,
 ) -> None:
     """One pass of G policies over their batches x [G, B, 64]; writes the gradients of all layers.
 
-    `output_gradient` maps outputs [G, O, B] to the loss's gradient there. ReLU and Dropout(0.5) cost three passes over
-    memory instead of torch's six: a unit to drop starts its sum far below zero, so the ReLU drops it, and its zero
-    tells the way back, too. What dropout multiplies by, 2, waits for the next product.
+    `output_gradient` maps outputs [G, O, B] to the loss's gradient there. A unit to drop starts its sum far below zero,
+    so the ReLU drops it, and its zero tells the way back, too: dropout costs the two passes over memory that make the
+    mask. What dropout multiplies by, 2, waits for the next product.
     """
+    groups, rows, _ = x.shape
     activations = [x]
     for depth, (layer, bits) in enumerate(zip(layers[:-1], words, strict=True)):
-        hidden = dropped(bits, x.shape[1])
+        hidden = dropped(bits, rows, scratch, f"hidden {depth}")
         hidden.baddbmm_(activations[-1], layer.weight, beta=_DROPPED, alpha=_KEPT if depth else 1)
         activations.append(hidden.add_(layer.bias).relu_())
     outputs = torch.baddbmm(layers[-1].bias, activations[-1], layers[-1].weight, alpha=_KEPT)
@@ -225,7 +245,8 @@ def forward_backward(
         torch.sum(gradient, 1, keepdim=True, out=layer.bias_gradient)
         layer.weight_gradient.baddbmm_(hidden.transpose(1, 2), gradient, beta=0, alpha=_KEPT if depth else 1)
         if depth:
-            gradient = torch.bmm(gradient, layer.weight.transpose(1, 2).mul(_KEPT))
+            above, gradient = gradient, scratch.take(f"gradient {depth}", (groups, rows, hidden.shape[2]), x)
+            gradient.baddbmm_(above, layer.weight.transpose(1, 2), beta=0, alpha=_KEPT)
             torch.ops.aten.threshold_backward.grad_input(gradient, hidden, 0.0, grad_input=gradient)
 
 
@@ -352,6 +373,7 @@ class PolicyEnsemble(lightning.LightningModule):
         self.seeds, self.settings = tuple(seeds), settings
         self._data, self._crew, self._after_epoch = data, crew, after_epoch
         self.stacks = nn.ParameterDict({name: nn.Parameter(stack(seeds, name)) for name in WIDTHS})
+        self._scratch = Scratch()
         each = [slice(row, row + 1) for row in range(len(self.seeds))]
         self._groups = each if crew else [slice(0, len(self.seeds))]
 
@@ -400,7 +422,8 @@ class PolicyEnsemble(lightning.LightningModule):
     def _pass(self, name: str, index: int, rows: slice) -> None:
         group, count = self._groups[index], rows.stop - rows.start
         order = self._order[group, rows]
-        x = torch.index_select(self._data.x, 0, order.reshape(-1)).view(len(order), count, LATENT)
+        x = self._scratch.take("x", (order.numel(), LATENT), self._data.x)
+        torch.index_select(self._data.x, 0, order.reshape(-1), out=x)
         frames = len(self._data.x)
         words = []
         for layer in self._bits[name]:
@@ -408,7 +431,13 @@ class PolicyEnsemble(lightning.LightningModule):
             words.append(layer[group, rows.start * each : rows.stop * each])
         gradient = _steering_gradient if name == "steering" else _acceleration_gradient
         labels = (self._steering if name == "steering" else self._acceleration)[group, None, rows]
-        forward_backward(self._layers[name][index], x, words, lambda outputs: gradient(outputs, labels))
+        forward_backward(
+            self._layers[name][index],
+            x.view(len(order), count, LATENT),
+            words,
+            lambda outputs: gradient(outputs, labels),
+            self._scratch,
+        )
 
     def on_train_epoch_end(self) -> None:
         """Measure every policy without dropout."""

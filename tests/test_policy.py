@@ -19,6 +19,7 @@ from study.policy import (
     WIDTHS,
     Labels,
     Layer,
+    Scratch,
     TrainedPolicies,
     draw_epoch,
     dropped,
@@ -124,7 +125,7 @@ def test_an_epoch_shows_every_frame_once() -> None:
 def test_every_unit_is_dropped_with_probability_one_half() -> None:
     rows, hidden = 4096, 64
     words = draw_epoch((0,), 0, rows).bits["acceleration"][1]
-    mask = dropped(words, rows)
+    mask = dropped(words, rows, Scratch())
     assert mask.shape == (1, rows, hidden)
     assert set(mask.unique().tolist()) == {0.0, 2.0}
     deviation = 0.5 / rows**0.5
@@ -134,7 +135,7 @@ def test_every_unit_is_dropped_with_probability_one_half() -> None:
 
 def test_dropped_units_are_independent_of_each_other() -> None:
     rows = 4096
-    mask = dropped(draw_epoch((0,), 0, rows).bits["acceleration"][1], rows)[0] - 1
+    mask = dropped(draw_epoch((0,), 0, rows).bits["acceleration"][1], rows, Scratch())[0] - 1
     correlation = mask.T @ mask / rows - torch.eye(64)
     assert correlation.abs().max() < 6 / rows**0.5
     neighbours = (mask[1:] * mask[:-1]).mean(0)
@@ -158,11 +159,15 @@ def test_dropout_keeps_the_mean() -> None:
         return outputs
 
     forward_backward(
-        [Layer(zero, one, *gradients), Layer(zero, one, *gradients), last], torch.zeros(1, rows, width), words, keep
+        [Layer(zero, one, *gradients), Layer(zero, one, *gradients), last],
+        torch.zeros(1, rows, width),
+        words,
+        keep,
+        Scratch(),
     )
     assert abs(seen[0].mean().item() - 1) < 5 / (rows * width) ** 0.5
     second = Layer(torch.full((1, width, width), 1 / width), torch.zeros(1, 1, width), *gradients)
-    forward_backward([Layer(zero, one, *gradients), second, last], torch.zeros(1, rows, width), words, keep)
+    forward_backward([Layer(zero, one, *gradients), second, last], torch.zeros(1, rows, width), words, keep, Scratch())
     assert abs(seen[1].mean().item() - 1) < 5 * (2 / (rows * width)) ** 0.5
 
 
@@ -243,7 +248,7 @@ def test_one_group_of_all_seeds_is_the_same_as_one_group_each() -> None:
         for w in weights
     ]
     apart = [Layer(w, b, torch.zeros_like(w), torch.zeros_like(b)) for w, b, *_ in together]
-    forward_backward(together, x, words, lambda outputs: outputs / rows)
+    forward_backward(together, x, words, lambda outputs: outputs / rows, Scratch())
     for s in range(seeds):
         own = slice(s, s + 1)
         forward_backward(
@@ -251,6 +256,7 @@ def test_one_group_of_all_seeds_is_the_same_as_one_group_each() -> None:
             x[own],
             [layer[own] for layer in words],
             lambda outputs: outputs / rows,
+            Scratch(),
         )
     for one, other in zip(together, apart, strict=True):
         torch.testing.assert_close(one.weight_gradient, other.weight_gradient, rtol=1e-4, atol=1e-5)
