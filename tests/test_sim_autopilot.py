@@ -7,8 +7,9 @@ import pytest
 
 from study.config import ACCELERATIONS, TownSettings
 from study.episode import GREEN, RED
-from study.sim.autopilot import DT, LENGTH
+from study.sim.autopilot import DT
 from study.sim.env import Traffic, make_traffic
+from study.sim.town import LENGTH
 
 
 @dataclass

@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from study.config import ACCELERATIONS
 from study.episode import GREEN, RED, YELLOW
-from study.sim.town import Town
+from study.sim.town import LENGTH, WIDTH, Town
 
 DT = 0.1  # [s]
-LENGTH, WIDTH = 5.0, 2.0  # of every vehicle [m], highway-env's
 STEERING_UNIT = 2.4  # wheel angle [rad] of a steering label of one
 THROTTLE = {0.5: 1.0, 1.0: 2.5}  # [m/s2] at rest, fading with speed
 TOP_SPEED = 25.0  # where the throttle has faded to nothing [m/s]
@@ -303,10 +302,10 @@ class Fleet:
         before = ruled & (front <= 0)
         bound = before & (state != GREEN)
         way = speed * speed / (2 * BRAKE)
-        fresh = bound & ~self.stopping & ~self.running & (-front <= way + 0.2 * speed + 2.5)
-        late = fresh & (state == YELLOW) & (-front < way)
-        self.running = (self.running & ruled & (front <= 0) & (state != GREEN)) | late
-        self.stopping = (self.stopping & bound) | (fresh & ~late)
+        late = bound & (-front < way + DT * speed)  # cannot stop any more
+        heeded = bound & (-front <= way + 0.2 * speed + 2.5)
+        self.running = late & ~self.stopping & ((state == YELLOW) | self.running)
+        self.stopping = (self.stopping & bound) | (heeded & ~self.running)
         return np.where(before, state, np.where(ruled, GREEN, RED)).astype(np.uint8)
 
     def _right_of_way(

@@ -16,7 +16,6 @@ from study.episode import GREEN
 from study.sim.autopilot import (
     BRAKE,
     DT,
-    LENGTH,
     LOOK,
     MOST_STEERING,
     REACH,
@@ -28,7 +27,7 @@ from study.sim.autopilot import (
 )
 from study.sim.lights import LightPlan, plan_lights
 from study.sim.road import TownNetwork, TownRoad, TownVehicle
-from study.sim.town import Town, draw_town
+from study.sim.town import LENGTH, Town, draw_town
 
 EGO = 0  # position of the ego among the vehicles
 APART = 14.0  # vehicles start at least so far from each other [m]

@@ -18,9 +18,9 @@ import numpy as np
 
 from study.config import FORMAT_VERSIONS, BadInputError, RecordingSettings, TownSettings
 from study.episode import Agent, Episode, Lane, Light, empty_states, write_episode
-from study.sim.autopilot import DT, LENGTH, STEERING_UNIT, WIDTH
+from study.sim.autopilot import DT, STEERING_UNIT
 from study.sim.env import TownEnv, Traffic
-from study.sim.town import LANE_WIDTH, Floats, Town
+from study.sim.town import LANE_WIDTH, LENGTH, WIDTH, Floats, Town
 
 FORMAT_VERSION = FORMAT_VERSIONS["episodes"]  # raised when the same settings and seed give another drive
 BEYOND = 60.0  # of the planned route that is recorded behind the last position [m]

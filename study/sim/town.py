@@ -25,8 +25,10 @@ CORNER = 7.0  # radius of the kerb where two streets of a junction meet [m]
 BEND = (14.0, 20.0)  # from the corner of a bend to where its arc starts [m]
 SHORTEST_STREET = 16.0  # between two stop lines [m]: two waiting vehicles
 FASTEST = 50.0  # highest speed limit [km/h]
-CLEARANCE = 2.8  # centre lines nearer than this cannot be driven side by side [m]
-SAMPLE = 0.5  # spacing of points where lines are compared [m]
+LENGTH, WIDTH = 5.0, 2.0  # of every vehicle [m], highway-env's
+DISCS = np.array([-LENGTH / 3, 0.0, LENGTH / 3])  # along a vehicle: three discs of COVER radius cover it [m]
+COVER = math.hypot(LENGTH / 6, WIDTH / 2)  # [m]
+SLACK = 0.3  # vehicles do not follow their lines exactly [m]
 
 Floats = NDArray[np.float64]
 Turn = Literal["left", "straight", "right"]
@@ -100,7 +102,8 @@ class Signal:
 class Town:
     """A drawn town. M movements; positions in `strips` and `movements` are their names everywhere in the simulator.
 
-    `enter`, `leave`: [M, M] m, the part of movement a on which it is in the way of movement b; NaN if they never meet.
+    `enter`, `leave`: [M, M] m, where along movement a the front bumper gets, and the rear bumper is out of, the way of
+    vehicles on movement b; NaN if they never meet.
     `opposing`: [M, M] bool, whether b comes from the arm across. `signal_of`: strip -> its signal, -1 where none.
     `phases`: node -> number of phases of its lights, 0 where there are none. `junctions`: nodes of three or more arms.
     """
@@ -180,17 +183,6 @@ def _connect(start: tuple[float, float, float], end: tuple[float, float, float],
     return pieces
 
 
-def _sampled(pieces: list[Piece]) -> tuple[Floats, Floats]:
-    """Points [P, 2] along joined pieces and their distances [P] from the start."""
-    points, distances, done = [], [], 0.0
-    for piece in pieces:
-        s = np.linspace(0, piece.length, max(int(piece.length / SAMPLE), 1) + 1)
-        points.append(np.stack(piece.at(s)[:2], axis=1))
-        distances.append(s + done)
-        done += piece.length
-    return np.concatenate(points), np.concatenate(distances)
-
-
 # --- junctions ------------------------------------------------------------------------------------------------------
 
 
@@ -237,9 +229,7 @@ def _junction(arms: tuple[int, int, int, int], reach: float) -> _Junction:
             for turn, to in exits:
                 if turn not in offered[lane]:
                     continue
-                beside = bend or (turn == "straight" and lanes == 2 and len(exits) == 3 and arms[to] == 2)
-                # nobody changes lanes on a street: wherever no other lane goes the same way, both can be reached
-                for to_lane in [lane] if beside else range(arms[to]):
+                for to_lane in _exit_lanes(turn, lane, lanes, arms[to], ways=1 if bend else len(exits)):
                     pieces = _connect(
                         _pose(arm, lane, reach, inbound=True), _pose(to, to_lane, reach, inbound=False), turn
                     )
@@ -247,20 +237,48 @@ def _junction(arms: tuple[int, int, int, int], reach: float) -> _Junction:
     return _Junction(tuple(ways), *_conflicts(ways))
 
 
+def _exit_lanes(turn: Turn, lane: int, lanes: int, to_lanes: int, *, ways: int) -> list[int]:
+    """Lanes that a turn of a lane leads to: any that no other vehicle of the same green may need.
+
+    More than one, because nobody changes lanes on a street.
+    """
+    if ways == 1 or (ways == 3 and turn == "straight" and lanes == to_lanes):
+        return [lane]
+    if ways == 3 and turn == "left":  # or left turns from across would meet
+        return [0]
+    return list(range(to_lanes))
+
+
 def _conflicts(ways: list[_Way]) -> tuple[Floats, Floats]:
     """Where ways from different arms are in each other's way, as in `Town`."""
     enter = np.full((len(ways), len(ways)), np.nan)
     leave = enter.copy()
-    lines = [_sampled(list(way.pieces)) for way in ways]
-    for a, (points_a, s) in enumerate(lines):
-        for b, (points_b, _) in enumerate(lines):
+    bodies = [_bodies(way.pieces) for way in ways]
+    for a, (discs_a, s_a) in enumerate(bodies):
+        for b, (discs_b, s_b) in enumerate(bodies[:a]):
             if ways[a].arm == ways[b].arm:
                 continue
-            squared = ((points_a[:, None] - points_b[None]) ** 2).sum(-1)
-            near = np.flatnonzero(squared.min(axis=1) < CLEARANCE**2)
-            if len(near):
-                enter[a, b], leave[a, b] = s[near[0]], s[near[-1]]
+            delta = discs_a.reshape(-1, 1, 2) - discs_b.reshape(1, -1, 2)
+            near = (delta * delta).sum(-1) < (2 * COVER + SLACK) ** 2
+            meet = near.reshape(len(s_a), len(DISCS), len(s_b), len(DISCS)).any(axis=(1, 3))
+            for one, other, s, own in ((a, b, s_a, meet.any(axis=1)), (b, a, s_b, meet.any(axis=0))):
+                if own.any():
+                    enter[one, other], leave[one, other] = s[own][0] + LENGTH / 2, s[own][-1] - LENGTH / 2
     return enter, leave
+
+
+def _bodies(pieces: tuple[Piece, ...]) -> tuple[Floats, Floats]:
+    """Where the discs of a vehicle on its way are, [P, 3, 2] m, and how far along its centre is then, [P] m."""
+    discs, distances, done = [], [], 0.0
+    for piece in pieces:
+        s = np.linspace(0, piece.length, math.ceil(piece.length) + 1)
+        x, y, heading = piece.at(s)
+        heading = heading - math.asin(piece.curvature * LENGTH / 2)  # a vehicle's middle slips outwards
+        axis = np.stack([np.cos(heading), np.sin(heading)], axis=1)
+        discs.append(np.stack([x, y], axis=1)[:, None] + DISCS[:, None] * axis[:, None])
+        distances.append(s + done)
+        done += piece.length
+    return np.concatenate(discs), np.concatenate(distances)
 
 
 # --- the grid -------------------------------------------------------------------------------------------------------
