@@ -23,6 +23,8 @@ from study.policy import train_policies
 from study.provenance import provenance
 from study.result import NO_SEED, CellJob, CellResult
 
+STATE = ("speed", "light", "lead_gap")  # columns of the labels that reports probe the latents for
+
 Log = Callable[[str, int, dict[str, float]], None]
 Progress = Callable[[str, int, int], None]
 
@@ -93,6 +95,7 @@ def run_cell(job: CellJob, log: Log, progress: Progress) -> CellResult:
             "acceleration_label": labels["acceleration"].to_numpy(np.uint8),
             "steering_label": labels["steering"].to_numpy(np.float32),
             "episode": labels["episode"].to_numpy(np.int32),
+            **{name: labels[name].to_numpy() for name in STATE},
             "z": z_test,
         },
         facts={

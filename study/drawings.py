@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from study import claims, figures, stats
 from study.figures import Drawing
-from study.result import SweepRecord
+from study.result import CellResult, SweepRecord
 from study.summary import Numbers
 
 HEAD_WORDS = {"rec": "reconstruction", "pred": "prediction", "plan": "planning"}
@@ -20,7 +22,7 @@ def draw(record: SweepRecord, made: Numbers) -> list[Drawing]:
         own = [*_speed(record, made), *_fractions(made)]
     else:
         own = [_heads(record, made, "test", "main"), _heads(record, made, "train", "train")]
-    return [*own, *_differences(made), *_pictures(record, made)]
+    return [*own, *_differences(made), *_latents(record, made), *_pictures(record, made)]
 
 
 def _bands(made: Numbers) -> str:
@@ -47,7 +49,7 @@ def _heads(record: SweepRecord, made: Numbers, split: str, place: str) -> Drawin
         f"{split}_compare_heads",
         place,
         f"Policies on frozen encoders by epoch, {split} split: (a) steering loss, (b) acceleration accuracy, for "
-        f"encoders trained with {names}. {_bands(made)} The accuracy axis is cut; the first epochs begin below it. "
+        f"encoders trained with {names}. {_bands(made)} Where the accuracy axis is cut, it says so. "
         f"The paper's fig:{split}_compare_heads.",
         f"Two line charts of steering loss and acceleration accuracy by epoch on the {split} split. On test {alt}.",
         figures.compare_heads(steering, accuracy, floor["steering"], floor["accuracy"], split),
@@ -69,7 +71,8 @@ def _speed(record: SweepRecord, made: Numbers) -> list[Drawing]:
             "main",
             f"Test acceleration accuracy by policy epoch: full at every data fraction against {base} at the largest. "
             f"{_bands(made)} Dotted: {base}'s final accuracy (mean of its last {stats.LAST} epochs) and the epoch at "
-            "which each mean curve first reaches it. The axis is cut. The paper's fig:datasize_convergespeed.",
+            "which each mean curve first reaches it. Where the axis is cut, it says so. The paper's "
+            "fig:datasize_convergespeed.",
             f"Line chart. Epoch at which full reaches {base}'s final accuracy, by fraction: {told}.",
             figures.converge_speed(bands, base, reached, floor),
         )
@@ -91,7 +94,8 @@ def _fractions(made: Numbers) -> list[Drawing]:
             "fractions",
             f"Test (a) steering loss and (b) acceleration accuracy, mean of the last {stats.LAST} epochs, by share of "
             f"the encoder's training data. Thin bar: one standard deviation over {_over(made)}; thick bar: 95 % "
-            f"interval of the mean ({kind}). The accuracy axis is cut. The paper's fig:datasize_compare.",
+            f"interval of the mean ({kind}). Where the accuracy axis is cut, it says so. The paper's "
+            "fig:datasize_compare.",
             f"Two dot plots by data fraction. Accuracy: {told}.",
             figures.compare_fractions(
                 pd.DataFrame(rows).astype({"sd": float, "low": float, "high": float}),
@@ -142,10 +146,40 @@ def _differences(made: Numbers) -> list[Drawing]:
     ]
 
 
+def _latents(record: SweepRecord, made: Numbers) -> list[Drawing]:
+    """Latent maps of one encoder of each head set, at the largest fraction."""
+    found = _first_results(record, made)
+    maps = []
+    for name, result in found.items():
+        own = result.predictions
+        places, shares = stats.principal(own["z"])
+        speed = own.get("speed")
+        if speed is None:
+            return []
+        maps.append((name, places, shares, speed, own["acceleration_label"]))
+    encoders = "one encoder each" if made["sweep"]["encoder_seeds"] == 1 else "the first encoder of each"
+    count = len(maps[0][1]) if maps else 0
+    return [
+        Drawing(
+            "latent_maps",
+            "latents",
+            f"Latents of the policy set's {count} test frames on their first two principal components (of z-scored "
+            f"dimensions; {encoders}), coloured by the vehicle's speed and by what the expert did.",
+            "Scatter plots of latents for each head set, coloured by speed in the first row and by the expert's "
+            "acceleration class in the second.",
+            figures.latent_maps(maps),
+        )
+    ] * bool(maps)
+
+
+def _first_results(record: SweepRecord, made: Numbers) -> dict[str, CellResult]:
+    top = max(record.grid.fractions)
+    return {name: results[0] for name in made["sweep"]["heads"] if (results := claims.results_at(record, (name, top)))}
+
+
 def _pictures(record: SweepRecord, made: Numbers) -> list[Drawing]:
     """What the decoders of one encoder of each kind make of test frames."""
-    top = max(record.grid.fractions)
-    found = {name: results[0] for name in made["sweep"]["heads"] if (results := claims.results_at(record, (name, top)))}
+    found = _first_results(record, made)
     drawings = []
     if "rec" in found:
         samples = found["rec"].samples
@@ -177,4 +211,26 @@ def _pictures(record: SweepRecord, made: Numbers) -> list[Drawing]:
                 figures.picture_rows(rows[:-1]),
             )
         )
+    if len(found) > 1:
+        drawings.append(
+            Drawing(
+                "all_head_sets",
+                "pictures",
+                "The same test frames through the networks of all head sets, with targets. Brighter is more certain.",
+                f"Rows of bird-view pictures: outputs of {', '.join(found)} for the same inputs, with their targets.",
+                figures.picture_rows(_side_by_side(found)),
+            )
+        )
     return drawings
+
+
+def _side_by_side(found: dict[str, CellResult]) -> list[tuple[str, NDArray[np.uint8]]]:
+    """Rows of pictures: for each head its target, then the output of every head set that has it."""
+    rows = [("input", next(iter(found.values())).samples["input"])]
+    for head in HEAD_WORDS:
+        owners = {name: result.samples for name, result in found.items() if f"{head}_output" in result.samples}
+        targets = [samples[f"{head}_target"] for samples in owners.values() if f"{head}_target" in samples]
+        if head != "rec" and owners:
+            rows += [("", targets[0]), (f"{head} target", targets[0])]
+        rows += [(f"{head} of {name}", samples[f"{head}_output"]) for name, samples in owners.items()]
+    return rows

@@ -20,11 +20,14 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from numpy.typing import NDArray
 
+from study.config import ACCELERATIONS
+
 COLOUR = {"rec": "#000000", "rec+pred": "#E69F00", "rec+plan": "#0072B2", "full": "#D55E00"}
 LINE = {"rec": "-", "rec+pred": "-.", "rec+plan": "--", "full": "-"}
 MARKER = {"rec": "o", "rec+pred": "^", "rec+plan": "s", "full": "D"}
 FRACTION_COLOUR = ("#D55E00", "#E69F00", "#009E73", "#56B4E9", "#CC79A7")
 FRACTION_MARKER = ("D", "^", "s", "v", "P")
+CLASS_COLOUR = ("#0072B2", "#E69F00", "#009E73")  # of the acceleration classes
 GREY = "#666666"
 WIDTH = 6.4  # [in], the report's text width
 LATE = 0.05  # share of the epochs after which the axis of a curve shows everything
@@ -302,6 +305,55 @@ def differences(rows: Sequence[Mapping[str, float | str]], allowance: float) -> 
         axes.spines["left"].set_visible(False)
         axes.tick_params(axis="y", length=0)
         axes.set_xlabel("difference in acceleration accuracy, test [percentage points]")
+    return figure
+
+
+# --- latents --------------------------------------------------------------------------------------------------------
+
+Map = tuple[str, NDArray[np.float64], NDArray[np.float64], NDArray[np.float32], NDArray[np.uint8]]
+
+
+def latent_maps(maps: Sequence[Map], most: int = 1500) -> Figure:
+    """Two rows of scatter plots, one column for each head set: by speed, and by acceleration class.
+
+    Each map is a name, places [N, 2], their shares of the variance [2], speed [N] [m/s] and class [N]; at most `most`
+    evenly spread frames are drawn.
+    """
+    with mpl.rc_context(STYLE):
+        figure, axes = _figure(3.4, columns=len(maps), rows=2)
+        for column, (name, places, shares, speed, kind) in enumerate(maps):
+            every = max(len(places) // most, 1)
+            x, y = places[::every].T
+            above, below = axes[column], axes[len(maps) + column]
+            shown = above.scatter(x, y, c=speed[::every], s=3, cmap="cividis", vmin=0, linewidths=0, rasterized=True)
+            for index, command in enumerate(ACCELERATIONS):
+                here = kind[::every] == index
+                below.scatter(
+                    x[here],
+                    y[here],
+                    s=3,
+                    color=CLASS_COLOUR[index],
+                    linewidths=0,
+                    label=f"{command:g}",
+                    rasterized=True,
+                )
+            above.set_title(name)
+            below.set_xlabel(f"{100 * shares[0]:.0f} + {100 * shares[1]:.0f} % of variance", fontsize=6.5)
+        for panel in axes:
+            panel.set_xticks([])
+            panel.set_yticks([])
+        figure.colorbar(shown, ax=axes[len(maps) - 1], label="speed [m/s]")
+        axes[-1].legend(
+            title="throttle \N{MINUS SIGN} brake",
+            loc="center left",
+            bbox_to_anchor=(1.0, 0.5),
+            frameon=False,
+            fontsize=6.5,
+            title_fontsize=6.5,
+            markerscale=2.5,
+        )
+        axes[0].set_ylabel("by speed")
+        axes[len(maps)].set_ylabel("by command")
     return figure
 
 

@@ -66,7 +66,8 @@ class CellResult:
     `samples`: test frames of the encoder set: `input` [K, 64, 64, 3] uint8, and for each head `<head>_output` uint8
     ([K, 64, 64, 3] for rec, [K, 64, 64] else, 255 is one) and `<head>_target` for pred and plan.
     `predictions`: `acceleration` [S, N] uint8 class and `steering` [S, N] float32 after the last epoch, with
-    `acceleration_label`, `steering_label`, `episode` [N], and `z` [N, 64] float32 (not normalised).
+    `acceleration_label`, `steering_label`, `episode`, `speed` [m/s], `light` (0 none or green, 1 yellow, 2 red),
+    `lead_gap` [m] (NaN: free) [N], and `z` [N, 64] float32 (not normalised).
     `facts`: floor (majority accuracy on test), frames (counts), seconds per stage, peak_bytes, device, precision,
     threads, versions: whatever a reader needs to judge the numbers.
     """

@@ -464,3 +464,41 @@ def episode_accuracy(predicted: NDArray[np.uint8], label: NDArray[np.uint8], epi
 def pairs(points: Sequence[Point]) -> list[tuple[Point, Point]]:
     """All pairs, the later against the earlier."""
     return [(second, first) for first, second in itertools.combinations(points, 2)]
+
+
+# --- from latents ---------------------------------------------------------------------------------------------------
+
+
+def probe(z: NDArray[np.float32], target: Array, drive: NDArray[np.int32], folds: int = 5, ridge: float = 1.0) -> float:
+    """Share of a target's variance that a linear model of the latents explains on drives it has not seen (R2).
+
+    z [N, 64]; target [N], NaN where there is none; whole drives are held out in turn. NaN where fewer than `folds`
+    drives have the target, or it does not vary.
+    """
+    known = np.isfinite(target)
+    x, y, group = z[known].astype(np.float64), target[known], drive[known]
+    names = np.unique(group)
+    if len(names) < folds or np.ptp(y) == 0:
+        return math.nan
+    x = (x - x.mean(axis=0)) / np.maximum(x.std(axis=0), 1e-9)
+    error = total = 0.0
+    for held in np.array_split(generator("probe").permutation(names), folds):
+        test = np.isin(group, held)
+        mean = y[~test].mean()
+        inside = np.column_stack([x[~test], np.ones((~test).sum())])
+        penalty = ridge * np.diag([*np.ones(x.shape[1]), 0.0])
+        weights = np.linalg.solve(inside.T @ inside + penalty, inside.T @ y[~test])
+        guess = np.column_stack([x[test], np.ones(test.sum())]) @ weights
+        error += float(((y[test] - guess) ** 2).sum())
+        total += float(((y[test] - mean) ** 2).sum())
+    return 1 - error / total
+
+
+def principal(z: NDArray[np.float32]) -> tuple[Array, Array]:
+    """First two principal components of z-scored latents [N, 2], and their shares of the variance [2]."""
+    scaled = (z - z.mean(axis=0)) / np.maximum(z.std(axis=0), 1e-9)
+    _, values, axes = np.linalg.svd(scaled.astype(np.float64), full_matrices=False)
+    axes = axes[:2]
+    # A component's sign is arbitrary: let its largest weight be positive.
+    axes = axes * np.sign(axes[np.arange(2), np.abs(axes).argmax(axis=1)])[:, None]
+    return np.asarray(scaled @ axes.T), np.asarray((values**2 / (values**2).sum())[:2])

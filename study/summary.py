@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -13,13 +13,14 @@ import pandas as pd
 
 from study import claims, stats
 from study.config import ACCELERATIONS, HEAD_SETS, parameter_counts
-from study.result import SweepRecord
+from study.result import CellResult, SweepRecord
 from study.stats import Estimate, Panel, Point
 
 FORMAT_VERSION = 1
 SHOWN_PACKAGES = ("torch", "lightning", "highway-env", "gymnasium", "numpy", "scipy", "mlflow", "optuna", "typst")
 SIMULATOR = "a town of our own on highway-env, in the place of CARLA's Town03"
 METRICS = {"accuracy": stats.ACCURACY, "steering": stats.STEERING, "balanced": "balanced_accuracy"}
+NEAR = 30.0  # [m] a lead vehicle farther away may be outside the image
 
 Numbers = dict[str, Any]
 
@@ -55,6 +56,7 @@ def numbers(record: SweepRecord) -> Numbers:
             {"cell": claims.label(point, grid), **stats.variance_components(accuracy[point])} for point in points
         ],
         "encoders": _encoders(record, table),
+        "probes": _probes(record),
         "claims": verdicts,
         "rules": grid.rules.model_dump(mode="json"),
         "settings": _settings(record),
@@ -63,7 +65,9 @@ def numbers(record: SweepRecord) -> Numbers:
         "cost": _cost(record),
         "provenance": _provenance(record),
     }
-    made["sweep"]["summary"] = _summary(made, verdicts)
+    made["outcomes"] = {
+        outcome: [verdict.claim for verdict in verdicts if verdict.outcome == outcome] for outcome in claims.OUTCOMES
+    }
     plain: Numbers = _plain(made)
     return plain
 
@@ -200,6 +204,33 @@ def _encoders(record: SweepRecord, table: pd.DataFrame) -> list[Numbers]:
     return made
 
 
+def _probes(record: SweepRecord) -> list[Numbers]:
+    """What a linear model reads off the latents of the policy set's test frames, mean over encoders."""
+    rows = []
+    for point in _points(record):
+        found = [_probed(result) for result in claims.results_at(record, point)]
+        if found and all(found):
+            means = {name: float(np.mean([one[name] for one in found])) for name in found[0]}
+            rows.append({"cell": claims.label(point, record.grid), "encoders": len(found), **means})
+    return rows
+
+
+def _probed(result: CellResult) -> dict[str, float]:
+    """R2 of each probed quantity; empty for a result of a version that did not keep them."""
+    own = result.predictions
+    if not {"speed", "light", "lead_gap"} <= set(own):
+        return {}
+    gap = own["lead_gap"].astype(np.float64)
+    targets = {
+        "speed": own["speed"],
+        "stop": own["light"] > 0,
+        "gap": np.where(gap <= NEAR, gap, np.nan),
+        "steering": own["steering_label"],
+        "brake": own["acceleration_label"] == 0,
+    }
+    return {name: stats.probe(own["z"], np.asarray(v, np.float64), own["episode"]) for name, v in targets.items()}
+
+
 def _settings(record: SweepRecord) -> list[Numbers]:
     """Every setting with its meaning and whether it differs from the program's default."""
     rows = []
@@ -281,34 +312,3 @@ def _provenance(record: SweepRecord) -> Numbers:
         "cell_commits": sorted(commits),
         "keys": {cell.label: key for key, cell in record.planned.items()},
     }
-
-
-def _summary(made: Numbers, verdicts: Sequence[claims.Verdict]) -> list[str]:
-    """The first page in words."""
-    sweep, floor = made["sweep"], made["floor"]
-    lines = []
-    if verdicts:
-        counts = {outcome: [item.claim for item in verdicts if item.outcome == outcome] for outcome in claims.OUTCOMES}
-        told = [f"{len(names)} {outcome} ({', '.join(names)})" for outcome, names in counts.items() if names]
-        lines.append(f"Of {len(verdicts)} claims that this sweep tests: {'; '.join(told)}.")
-    if made["scores"]:
-        shown = [
-            score for score in made["scores"] if score["fraction"] in (sweep["fractions"][0], sweep["fractions"][-1])
-        ]
-        values = [
-            f"{score['cell']} {100 * score['accuracy']['mean']:.1f} % (sd {100 * score['accuracy']['sd']:.2f})"
-            for score in shown
-        ]
-        lines.append(
-            f"Acceleration accuracy on test drives, mean of the last {stats.LAST} of {sweep['policy_epochs']} epochs, "
-            f"mean and sd over {_seeds(made['scores'][0])}: {'; '.join(values)}. "
-            f"Always saying the commonest class gives {100 * floor['accuracy']:.1f} %."
-        )
-    return lines
-
-
-def _seeds(score: Numbers) -> str:
-    count, encoders = score["n"], score["encoders"]
-    if encoders == 1:
-        return f"{count} policies on one encoder"
-    return f"{count} policies on {encoders} encoders"

@@ -126,6 +126,9 @@ def simulate_cell(cell, key, settings, world, seeds, rng, labels):
             "acceleration_label": acceleration,
             "steering_label": steering,
             "episode": episode,
+            "speed": (10 * rng.random(FRAMES) * (acceleration > 0)).astype(np.float32),
+            "light": np.where(acceleration == 0, 2, 0).astype(np.uint8),
+            "lead_gap": np.where(rng.random(FRAMES) < 0.5, np.nan, 20.0).astype(np.float32),
             "z": (rng.normal(size=(FRAMES, 64)) + np.eye(64)[0] * 2 * acceleration[:, None]).astype(np.float32),
         },
         facts={

@@ -285,3 +285,33 @@ def test_data_fractions_keep_their_cells_apart():
     assert set(stats.panel(record.table(), stats.ACCURACY)) == {
         (heads, fraction) for heads in ("rec", "full") for fraction in DATASIZE_GRID.fractions
     }
+
+
+# --- latents --------------------------------------------------------------------------------------------------------
+
+
+def test_a_probe_finds_what_a_latent_holds_and_nothing_where_there_is_nothing():
+    rng = np.random.default_rng(0)
+    z, drive = rng.normal(size=(800, 64)).astype(np.float32), np.arange(800) // 40
+    held = z[:, 3] * 2.0 + 5
+    assert stats.probe(z, held, drive) > 0.95
+    assert stats.probe(z, rng.normal(size=800), drive) < 0.05
+    assert math.isnan(stats.probe(z, np.ones(800), drive))
+    assert math.isnan(stats.probe(z, held, np.zeros(800, int)))
+
+
+def test_a_probe_does_not_profit_from_twins_in_the_same_drive():
+    rng = np.random.default_rng(1)
+    drive = np.arange(800) // 40
+    own = rng.normal(size=(20, 64))
+    z = (own[drive] + 0.01 * rng.normal(size=(800, 64))).astype(np.float32)  # a latent tells the drive, nothing else
+    assert stats.probe(z, rng.normal(size=20)[drive], drive) < 0.3
+
+
+def test_principal_components_are_those_of_the_covariance():
+    rng = np.random.default_rng(0)
+    z = (rng.normal(size=(300, 4)) @ rng.normal(size=(4, 4))).astype(np.float32)
+    places, shares = stats.principal(z)
+    values = np.sort(np.linalg.eigvalsh(np.corrcoef(z.T)))[::-1]
+    np.testing.assert_allclose(shares, (values / values.sum())[:2], rtol=1e-4)
+    np.testing.assert_allclose(places.var(axis=0, ddof=0), values[:2], rtol=1e-3)
