@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, SupportsFloat
 
 import gymnasium as gym
@@ -32,6 +33,7 @@ from study.sim.town import LENGTH, Town, draw_town
 EGO = 0  # position of the ego among the vehicles
 APART = 14.0  # vehicles start at least so far from each other [m]
 APART_LATER = 25.0  # and enter at least so far from others on their way, if there is such a place [m]
+SPOTS = 200  # drawn, of which the first good one is taken
 START_SPEED = 5.0  # [m/s]
 OFF_ROUTE = 4.0  # an ego farther than this from its way has lost it [m]
 CURVATURES = (5.0, 10.0, 20.0)  # where the ego looks at its way [m]
@@ -54,6 +56,10 @@ class Traffic(TownRoad):
         self.decisions: Decisions
         streets = [k for k, strip in enumerate(town.strips) if k in town.ways and strip.piece.length > 2 * APART]
         self.streets = np.array(streets or sorted(town.ways), np.int64)
+        pieces = [strip.piece for strip in town.strips]
+        self.origins = np.array([(piece.x, piece.y) for piece in pieces])
+        self.directions = np.array([(math.cos(piece.heading), math.sin(piece.heading)) for piece in pieces])
+        self.lengths = np.array([piece.length for piece in pieces])
         for slot in range(settings.vehicles):
             self._enter(slot)
         self._follow()
@@ -66,22 +72,16 @@ class Traffic(TownRoad):
     def _enter(self, slot: int) -> None:
         """Put a new vehicle on a free spot of some street, in place of the one in `slot`, if there is one."""
         others = np.array([v.position for k, v in enumerate(self.vehicles) if k != slot]).reshape(-1, 2)
-        best, most = (int(self.streets[0]), APART), -1.0
-        enough = APART_LATER if self.steps else APART
-        for _ in range(200):
-            strip = int(self.np_random.choice(self.streets))
-            piece = self.town.strips[strip].piece
-            s = float(self.np_random.uniform(LENGTH, max(piece.length - APART, LENGTH + 1)))
-            x, y, _ = piece.at(np.array([s]))
-            free = float(np.hypot(others[:, 0] - x, others[:, 1] - y).min(initial=np.inf))
-            if free > most:
-                best, most = (strip, s), free
-            if free > enough:
-                break
-        strip, s = best
-        x, y, heading = self.town.strips[strip].piece.at(np.array([s]))
-        vehicle = TownVehicle(self, [float(x[0]), float(y[0])], float(heading[0]), START_SPEED)
-        self.fleet.place(slot, strip, s)
+        strips = self.np_random.choice(self.streets, SPOTS)
+        room = np.maximum(self.lengths[strips] - APART - LENGTH, 1.0)  # not right before a stop line
+        s = LENGTH + self.np_random.random(SPOTS) * room
+        spots = self.origins[strips] + s[:, None] * self.directions[strips]
+        free = np.sqrt(((spots[:, None] - others[None]) ** 2).sum(-1)).min(axis=1, initial=np.inf)
+        good = free > (APART_LATER if self.steps else APART)
+        best = int(good.argmax() if good.any() else free.argmax())
+        strip, (x, y) = int(strips[best]), spots[best].tolist()
+        vehicle = TownVehicle(self, [x, y], self.town.strips[strip].piece.heading, START_SPEED)
+        self.fleet.place(slot, strip, float(s[best]))
         if slot < len(self.vehicles):
             self.vehicles[slot] = vehicle
             self.agents[slot] = max(self.agents) + 1
@@ -97,7 +97,7 @@ class Traffic(TownRoad):
         """Decide every vehicle's command; one in `commands` has it from there."""
         pose = self.pose()
         self.light_states = self.lights.states(self.time)
-        decisions = self.fleet.decide(self.steps, pose, self.pairs_within(REACH), self.light_states)
+        decisions = self.fleet.decide(self.steps, pose, self.pairs_within(REACH, pose), self.light_states)
         for slot, (acceleration, steering) in self.commands.items():
             decisions.acceleration[slot], decisions.steering[slot] = acceleration, steering
         self.decisions = decisions

@@ -1,7 +1,7 @@
-"""highway-env's network, road and vehicle with spatial look-ups; one flag, `fast`, goes back to the stock ones.
+"""highway-env's network, road and vehicle, all vehicles at once; one flag, `fast`, goes back to the stock ones.
 
-Look-ups only find candidates: what decides is highway-env's own lane distance and its own polygons, so that a drive is
-the same with either. Kinematics are highway-env's.
+Look-ups only find candidates: what decides is highway-env's own lane distance and its own polygons. Motion is
+highway-env's formula, operation by operation. So a drive is the same, bit for bit, with either (tests/test_sim_env.py).
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ KNOWN = 9.0  # lanes this near to a cell's centre are listed with it [m]
 TIE = 1e-9  # scores nearer than this are settled by highway-env's own arithmetic
 
 Ints = NDArray[np.int64]
+Pose = tuple[Floats, Floats, Floats, Floats]  # x, y [m], heading [rad], speed [m/s]
 
 
 class TownNetwork(RoadNetwork):
@@ -72,8 +73,10 @@ class TownNetwork(RoadNetwork):
             end = np.minimum(((line.max(axis=0) + KNOWN - self.low) / CELL).astype(np.int64) + 1, self.cells)
             cx, cy = np.meshgrid(np.arange(begin[0], end[0]), np.arange(begin[1], end[1]), indexing="ij")
             centres = np.stack([cx.reshape(-1), cy.reshape(-1)], axis=1) * CELL + CELL / 2 + self.low
-            squared = ((centres[:, None] - line[None]) ** 2).sum(-1).min(axis=1)
-            distance = np.sqrt(squared) - 0.51  # samples are at most 1 m apart: never more than the true distance
+            dx, dy = centres[:, :1] - line[None, :, 0], centres[:, 1:] - line[None, :, 1]
+            distance = (
+                np.sqrt((dx * dx + dy * dy).min(axis=1)) - 0.51
+            )  # samples are at most 1 m apart: never more than the true distance
             close = distance < KNOWN
             cell = (cx.reshape(-1) * self.cells[1] + cy.reshape(-1))[close]
             columns.append((cell, np.full(len(cell), number), distance[close]))
@@ -163,17 +166,17 @@ class TownRoad(Road):
         """Whether the spatial look-ups are used."""
         return bool(self.network.fast)
 
-    def pose(self) -> tuple[Floats, Floats, Floats, Floats]:
+    def pose(self) -> Pose:
         """x, y [m], heading [rad] and speed [m/s] of all vehicles."""
-        positions = np.array([vehicle.position for vehicle in self.vehicles])
+        positions = np.concatenate([vehicle.position for vehicle in self.vehicles])
         heading = np.array([vehicle.heading for vehicle in self.vehicles], np.float64)
         speed = np.array([vehicle.speed for vehicle in self.vehicles], np.float64)
-        return positions[:, 0].copy(), positions[:, 1].copy(), heading, speed
+        return positions[::2].copy(), positions[1::2].copy(), heading, speed
 
-    def pairs_within(self, distance: float) -> tuple[Ints, Ints]:
+    def pairs_within(self, distance: float, pose: Pose) -> tuple[Ints, Ints]:
         """All (i, j), i != j, sorted, of vehicles that are nearer to each other than `distance` [m]."""
         if self.fast:
-            x, y, _, _ = self.pose()
+            x, y, _, _ = pose
             dx, dy = x[:, None] - x[None], y[:, None] - y[None]
             near = dx * dx + dy * dy < distance * distance
             np.fill_diagonal(near, val=False)
@@ -193,9 +196,7 @@ class TownRoad(Road):
         if not self.fast:
             super().step(dt)
             return
-        for vehicle in self.vehicles:
-            vehicle.step(dt)
-        pose = self.pose()
+        pose = self._move(dt)
         network = self.network
         lanes = network.closest_lanes(np.stack(pose[:2], axis=1), pose[2])
         for vehicle, lane in zip(self.vehicles, lanes, strict=True):
@@ -203,11 +204,36 @@ class TownRoad(Road):
         for i, j in zip(*self._touching(pose, dt), strict=True):
             self.vehicles[i].handle_collisions(self.vehicles[j], dt)
 
-    def _touching(self, pose: tuple[Floats, Floats, Floats, Floats], dt: float) -> tuple[Ints, Ints]:
+    def _move(self, dt: float) -> Pose:
+        """Vehicle.step for all vehicles; returns their new pose."""
+        x, y, heading, speed = self.pose()
+        steering = np.array([vehicle.action["steering"] for vehicle in self.vehicles], np.float64)
+        push = np.array([vehicle.action["acceleration"] for vehicle in self.vehicles], np.float64)
+        odd = [
+            k
+            for k, vehicle in enumerate(self.vehicles)
+            if vehicle.crashed or vehicle.impact is not None or abs(vehicle.speed) > vehicle.MAX_SPEED
+        ]
+        for k in odd:
+            self.vehicles[k].step(dt)
+        beta = np.arctan(1 / 2 * np.tan(steering))
+        course = heading + beta
+        place = np.stack([x + speed * np.cos(course) * dt, y + speed * np.sin(course) * dt], axis=1)
+        heading = heading + speed * np.sin(beta) / (TownVehicle.LENGTH / 2) * dt
+        speed = speed + push * dt
+        rows = zip(self.vehicles, place, heading.tolist(), speed.tolist(), strict=True)
+        for k, (vehicle, position, angle, velocity) in enumerate(rows):
+            if k not in odd:
+                vehicle.position, vehicle.heading, vehicle.speed = position, angle, velocity
+        return self.pose() if odd else (place[:, 0], place[:, 1], heading, speed)
+
+    def _touching(self, pose: Pose, dt: float) -> tuple[Ints, Ints]:
         """Pairs i < j that may touch within `dt`: no axis of the two boxes, moved as they will be, separates them."""
         x, y, heading, speed = pose
         reach = TownVehicle.LENGTH + TownVehicle.WIDTH + np.abs(speed) * dt  # more than highway-env's two diagonals
-        i, j = np.nonzero(np.triu((x[:, None] - x[None]) ** 2 + (y[:, None] - y[None]) ** 2 < reach[:, None] ** 2, 1))
+        dx, dy = x[:, None] - x[None], y[:, None] - y[None]
+        i, j = np.nonzero(dx * dx + dy * dy < (reach * reach)[:, None])
+        i, j = i[i < j], j[i < j]
         c, s = np.cos(heading), np.sin(heading)
         half_length, half_width = TownVehicle.LENGTH / 2, TownVehicle.WIDTH / 2
         apart = np.zeros(len(i), bool)
