@@ -11,6 +11,7 @@ Suffixes: S seeds, G seeds of a group, B rows of a batch, N frames, H hidden uni
 
 from __future__ import annotations
 
+import functools
 import itertools
 import logging
 import math
@@ -22,7 +23,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import lightning
@@ -57,7 +57,7 @@ METRICS = ("steering_loss", "acceleration_accuracy", "balanced_accuracy", "cross
 SPLITS = ("train", "test")
 
 _INIT, _EPOCH, _SUBSET = range(3)  # purposes of random numbers
-_WORD = 16  # random bits in an int16
+_WORD = 32  # random bits in an int32
 _TWO = 30  # the one bit that makes an int32 the float32 2.0
 _VECTOR = 16  # float32 in the widest register
 _DROPPED = -1e30  # takes a unit below zero, where the ReLU ends it
@@ -112,7 +112,7 @@ def normalise(weights: Mapping[str, NDArray[Any]], z: NDArray[np.float32]) -> ND
 
 
 class Draws(NamedTuple):
-    """All chance of one epoch: `order` [S, N] int64 and, for each hidden layer, bits [S, N * H / 16] int16."""
+    """All chance of one epoch: `order` [S, N] int64 and, for each hidden layer, bits [S, N * H / 32] int32."""
 
     order: Tensor
     bits: dict[str, tuple[Tensor, Tensor]]
@@ -126,11 +126,11 @@ def draw_epoch(seeds: Sequence[int], epoch: int, frames: int) -> Draws:
     words = {name: tuple(width // _WORD for width in widths[1:-1]) for name, widths in WIDTHS.items()}
     ends = np.cumsum([0, *(frames * each for layers in words.values() for each in layers)])
     order = np.empty((len(seeds), frames), np.int64)
-    bits = np.empty((len(seeds), ends[-1]), np.int16)
+    bits = np.empty((len(seeds), ends[-1]), np.int32)
     for row, seed in enumerate(seeds):
         rng = np.random.Generator(np.random.SFC64([seed, _EPOCH, epoch]))
         order[row] = rng.permutation(frames)
-        bits[row] = rng.bit_generator.random_raw(math.ceil(ends[-1] / 4)).view(np.int16)[: ends[-1]]
+        bits[row] = rng.bit_generator.random_raw(math.ceil(ends[-1] / 2)).view(np.int32)[: ends[-1]]
     parts = iter([torch.from_numpy(bits[:, a:b]) for a, b in itertools.pairwise(ends)])
     return Draws(torch.from_numpy(order), {name: (next(parts), next(parts)) for name in WIDTHS})
 
@@ -210,13 +210,18 @@ class Scratch(threading.local):
         return kept[:size].view(shape)
 
 
+@functools.cache
+def _shifts(device: torch.device) -> Tensor:
+    return torch.arange(_TWO, -1, -1, dtype=torch.int32, device=device)[:, None]
+
+
 def dropped(words: Tensor, rows: int, scratch: Scratch, use: str = "dropped") -> Tensor:
-    """Words of 16 random bits [G, B * H / 16] int16 as float32 [G, B, H]: 2.0 where the bit is set, 0.0 where not."""
-    words = words.to(torch.int32)
-    shifts = torch.arange(_TWO + 1 - _WORD, _TWO + 1, dtype=torch.int32, device=words.device)[:, None]
-    bits = scratch.take(use, (len(words), _WORD, words.shape[1]), words)
-    torch.bitwise_left_shift(words[:, None], shifts, out=bits).bitwise_and_(1 << _TWO)
-    return bits.view(torch.float32).view(len(words), rows, -1)
+    """Words of 32 random bits [G, B * H / 32] int32 as float32 [G, B, H]: 2.0 where the bit is set, 0.0 where not."""
+    words = words[:, None]
+    bits = scratch.take(use, (len(words), _WORD, words.shape[2]), words)
+    torch.bitwise_left_shift(words, _shifts(words.device), out=bits[:, :-1])  # bits 0 to 30
+    torch.bitwise_right_shift(words, 1, out=bits[:, -1:])  # bit 31
+    return bits.bitwise_and_(1 << _TWO).view(torch.float32).view(len(words), rows, -1)
 
 
 def forward_backward(
@@ -459,7 +464,7 @@ class PolicyEnsemble(lightning.LightningModule):
 
     def _share_out(self, work: Callable[[str, int], None]) -> None:
         """Do `work` for each network and group; steering, the larger network, comes first."""
-        jobs = [partial(work, name, index) for name in WIDTHS for index in range(len(self._groups))]
+        jobs = [functools.partial(work, name, index) for name in WIDTHS for index in range(len(self._groups))]
         if self._crew:
             self._crew.run(jobs)
         else:

@@ -150,7 +150,7 @@ def test_dropout_keeps_the_mean() -> None:
     average = torch.full((1, width, 1), 1 / width)
     last = Layer(average, torch.zeros(1, 1, 1), torch.empty(1, width, 1), torch.empty(1, 1, 1))
     words = [
-        torch.from_numpy(np.random.default_rng(k).integers(-(2**15), 2**15, (1, rows * 4), np.int16)) for k in (0, 1)
+        torch.from_numpy(np.random.default_rng(k).integers(-(2**31), 2**31, (1, rows * 2), np.int32)) for k in (0, 1)
     ]
     seen = []
 
@@ -185,7 +185,7 @@ class Masked(nn.Module):
 
 def unpacked(words: torch.Tensor, rows: int) -> torch.Tensor:
     """Which units are kept, [rows, H], bit by bit with numpy."""
-    bits = [words.numpy().view(np.uint16) >> (15 - bit) & 1 for bit in range(16)]
+    bits = [words.numpy().view(np.uint32) >> bit & 1 for bit in range(32)]
     return torch.from_numpy(1 - np.concatenate(bits).astype(np.float32)).view(rows, -1)
 
 
