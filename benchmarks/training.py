@@ -143,7 +143,6 @@ def policies(size: str) -> dict[str, Any]:
         theirs += [SEEDS * seconds for seconds in before + after]
         ratios.append(SEEDS * float(np.median(before + after)) / float(np.median(stack)))
     return {
-        "size": size,
         "frames": [frames, tests],
         "batch": batch,
         "seeds": SEEDS,
@@ -161,8 +160,11 @@ def main() -> None:
     size = sys.argv[1] if len(sys.argv) > 1 else "laptop"
     result = json.loads(RESULT.read_text()) if RESULT.exists() else {"encoder": None, "policies": None, "gpu": None}
     result["machine"] = {"cores": torch.get_num_threads(), "processor": platform.processor() or platform.machine()}
-    result["policies"] = policies(size)
-    print(json.dumps(result["policies"], indent=1))
+    measured = policies(size)
+    print(json.dumps(measured, indent=1))
+    sizes = (result["policies"] or {}) | {size: measured}
+    ratios = [sizes[name]["ratio_to_sequential"] for name in SIZES if name in sizes]
+    result["policies"] = sizes | {"ratio_to_sequential": min(ratios)}
     RESULT.parent.mkdir(exist_ok=True)
     RESULT.write_text(json.dumps(result, indent=1) + "\n")
 

@@ -488,8 +488,8 @@ def _acceleration_gradient(logits: Tensor, labels: Tensor) -> Tensor:
 def train_policies(
     z_train: NDArray[np.float32],
     z_test: NDArray[np.float32],
-    labels_train: Any,
-    labels_test: Any,
+    labels_train: pd.DataFrame,
+    labels_test: pd.DataFrame,
     seeds: Sequence[int],
     settings: PolicySettings,
     *,
@@ -547,8 +547,8 @@ def train_policies(
 def _check(
     z_train: NDArray[Any],
     z_test: NDArray[Any],
-    labels_train: Any,
-    labels_test: Any,
+    labels_train: pd.DataFrame,
+    labels_test: pd.DataFrame,
     seeds: Sequence[int],
     settings: PolicySettings,
 ) -> None:
@@ -573,7 +573,10 @@ def _check(
 
 
 def _policy_data(
-    scaling: Arrays, train: tuple[NDArray[Any], Any], test: tuple[NDArray[Any], Any], device: torch.device
+    scaling: Arrays,
+    train: tuple[NDArray[Any], pd.DataFrame],
+    test: tuple[NDArray[Any], pd.DataFrame],
+    device: torch.device,
 ) -> PolicyData:
     (x_train, y_train), (x_test, y_test) = (
         (
