@@ -261,8 +261,8 @@ def _conflicts(ways: list[_Way]) -> tuple[Floats, Floats]:
             dx = discs_a[:, :, 0].reshape(-1, 1) - discs_b[:, :, 0].reshape(1, -1)
             dy = discs_a[:, :, 1].reshape(-1, 1) - discs_b[:, :, 1].reshape(1, -1)
             near = dx * dx + dy * dy < (2 * COVER + SLACK) ** 2
-            meet: NDArray[np.bool_] = near.reshape(len(s_a), len(DISCS), len(s_b), len(DISCS)).any(axis=(1, 3))
-            for one, other, s, own in ((a, b, s_a, meet.any(axis=1)), (b, a, s_b, meet.any(axis=0))):
+            meet = near.reshape(len(s_a), len(DISCS), len(s_b), len(DISCS)).max(axis=(1, 3))
+            for one, other, s, own in ((a, b, s_a, meet.max(axis=1)), (b, a, s_b, meet.max(axis=0))):
                 if own.any():
                     enter[one, other], leave[one, other] = s[own][0] + LENGTH / 2, s[own][-1] - LENGTH / 2
     return enter, leave
