@@ -218,6 +218,7 @@ class MultiHeadAutoencoder(lightning.LightningModule):
         if heads not in HEAD_SETS:
             raise one_of("head set", heads, HEAD_SETS)
         self.settings = settings
+        self.automatic_optimization = False  # gradients come head by head, see `losses`
         self.encoder = Encoder(variational=settings.beta > 0)
         self.decoders = nn.ModuleDict({head: Decoder(HEADS[head]) for head in HEAD_SETS[heads]})
         initialise(self.encoder, _generator(encoder_seed, "encoder"))
@@ -234,23 +235,36 @@ class MultiHeadAutoencoder(lightning.LightningModule):
         z = self.encoder(images)
         return {head: decoder(z) for head, decoder in self.decoders.items()}
 
-    def losses(self, images: Tensor, masks: Tensor) -> Tensor:
-        """The losses named in `metrics`, of images [B, 64, 64, 3] uint8 and masks [B, 2, 512] uint8."""
+    def losses(self, images: Tensor, masks: Tensor, *, gradients: bool = False) -> Tensor:
+        """The losses named in `metrics`, of images [B, 64, 64, 3] uint8 and masks [B, 2, 512] uint8.
+
+        With `gradients`, those of the total loss are added to the parameters' on the way: one head after the other, so
+        that memory for the activations of one head suffices. The losses themselves never carry gradients.
+        """
         pixels = to_float(images)
         targets = {"rec": pixels} | unpack(masks, [head for head in self.decoders if head in MASKS])
         features = self.encoder.features(pixels)
         z = self.encoder.mean(features)
+        ends: list[tuple[Tensor, Tensor | None]] = []  # of the encoder's graph, with the gradient that comes in there
         divergence = []
         if self.encoder.log_variance is not None:
             mean, log_variance = z.float(), self.encoder.log_variance(features).float()
-            divergence.append((mean.square() + log_variance.exp() - 1 - log_variance).sum(1).mean() / (2 * _PIXELS))
+            kl = (mean.square() + log_variance.exp() - 1 - log_variance).sum(1).mean() / (2 * _PIXELS)
+            divergence.append(kl.detach())
+            ends.append((self.settings.beta * kl, None))
             if self.training:  # on the test split the mean stands for z, as for the policies
                 z = mean + torch.exp(log_variance / 2) * self._noise(mean)
-        parts = [
-            functional.binary_cross_entropy_with_logits(decoder(z), targets[head])
-            for head, decoder in self.decoders.items()
-        ]
+        given = z.detach().requires_grad_(gradients)
+        parts = []
         weights = [self.settings.head_weights.get(head, 1.0) for head in self.decoders]
+        for weight, (head, decoder) in zip(weights, self.decoders.items(), strict=True):
+            loss = functional.binary_cross_entropy_with_logits(decoder(given), targets[head])
+            if gradients:
+                torch.autograd.backward(weight * loss)
+            parts.append(loss.detach())
+        if gradients:
+            outputs, incoming = zip(*ends, (z, given.grad), strict=True)
+            torch.autograd.backward(outputs, incoming)
         weights += [self.settings.beta] * len(divergence)
         parts += divergence
         return torch.stack([sum(w * part for w, part in zip(weights, parts, strict=True)), *parts])  # type: ignore[list-item]
@@ -262,25 +276,26 @@ class MultiHeadAutoencoder(lightning.LightningModule):
                 self.noise.set_state(self.noise_state)
         return torch.randn(like.shape, generator=self.noise, device=like.device)
 
-    def training_step(self, batch: tuple[Tensor, Tensor]) -> Tensor:
-        """Total loss of a batch, for the optimiser."""
-        return self._measured("train", *batch)
+    def training_step(self, batch: tuple[Tensor, Tensor]) -> None:
+        """One step of the optimiser."""
+        optimizer = self.optimizers(use_pl_optimizer=False)
+        assert isinstance(optimizer, torch.optim.Optimizer)
+        optimizer.zero_grad()
+        self._note("train", self.losses(*batch, gradients=True), len(batch[0]))
+        optimizer.step()
 
     def validation_step(self, batch: tuple[Tensor, Tensor]) -> None:
         """Losses of a batch of the test split."""
-        self._measured("test", *batch)
+        self._note("test", self.losses(*batch), len(batch[0]))
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """Adam (Sec. IV-B)."""
         return torch.optim.Adam(self.parameters(), lr=self.settings.lr, fused=True)
 
-    def _measured(self, split: Split, images: Tensor, masks: Tensor) -> Tensor:
-        losses = self.losses(images, masks)
-        found = losses.detach()
-        weighted = torch.cat([found, found.new_ones(1)]).double() * len(images)
-        self.sums[split] = self.sums[split].to(found.device, non_blocking=True) + weighted
-        self.totals[split].append(found[0])
-        return losses[0]
+    def _note(self, split: Split, losses: Tensor, count: int) -> None:
+        weighted = torch.cat([losses, losses.new_ones(1)]).double() * count
+        self.sums[split] = self.sums[split].to(losses.device, non_blocking=True) + weighted
+        self.totals[split].append(losses[0])
 
     def reset_means(self) -> None:
         """Forget the losses seen."""
@@ -683,6 +698,10 @@ def _fit(module: MultiHeadAutoencoder, data: _Data, course: _Course, device: tor
         )
         try:
             trainer.fit(module, datamodule=data)
+        except torch.OutOfMemoryError as error:
+            raise BadInputError(
+                f"{device} has too little memory for batch {data.plan.batch} ({error}); lower --encoder.batch"
+            ) from error
         except SystemExit as error:
             if isinstance(error.__context__, KeyboardInterrupt):  # Lightning makes Ctrl-C an exit with code 1
                 raise KeyboardInterrupt from None

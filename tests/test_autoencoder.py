@@ -225,6 +225,34 @@ def test_loss_is_the_weighted_sum_of_cross_entropies(frames: Frames) -> None:
     assert found["loss"] == pytest.approx(total, rel=1e-5)
 
 
+def test_gradients_taken_head_by_head_are_those_of_the_total_loss(frames: Frames) -> None:
+    """Also through the noise of a variational encoder, and with weights."""
+    settings = EncoderSettings(beta=0.3, head_weights={"rec": 2.0, "plan": 0.5})
+    images, masks = torch.tensor(frames.images[:16]), torch.tensor(frames.masks[:16])
+    module = MultiHeadAutoencoder("full", settings, 0)
+    losses = dict(zip(module.metrics, module.losses(images, masks, gradients=True).tolist(), strict=True))
+
+    whole = MultiHeadAutoencoder("full", settings, 0)
+    pixels, targets = images.permute(0, 3, 1, 2) / 255, unpack(masks, ["pred", "plan"])
+    features = whole.encoder.features(pixels)
+    mean, log_variance = whole.encoder.mean(features), whole.encoder.log_variance(features)
+    noise = autoencoder._generator(0, "noise")
+    z = mean + (log_variance / 2).exp() * torch.randn(mean.shape, generator=noise)
+    normal = torch.distributions.Normal
+    kl = torch.distributions.kl_divergence(normal(mean, (log_variance / 2).exp()), normal(0.0, 1.0))
+    total = 0.3 * kl.sum(1).mean() / (3 * 64 * 64)
+    for head, weight in (("rec", 2.0), ("pred", 1.0), ("plan", 0.5)):
+        loss = functional.binary_cross_entropy_with_logits(whole.decoders[head](z), (targets | {"rec": pixels})[head])
+        total = total + weight * loss
+    total.backward()
+    assert losses["loss"] == pytest.approx(float(total.detach()), rel=1e-5)
+    for (name, ours), theirs in zip(module.named_parameters(), whole.parameters(), strict=True):
+        if theirs.grad is None:
+            assert ours.grad is None, name
+        else:
+            assert torch.allclose(ours.grad, theirs.grad, rtol=1e-3, atol=1e-4 * float(theirs.grad.abs().max())), name
+
+
 # --- training -------------------------------------------------------------------------------------------------------
 
 
@@ -405,6 +433,15 @@ def test_a_loss_that_is_not_finite_names_epoch_and_step(frames: Frames, tmp_path
     with pytest.raises(TrainingDivergedError, match="epoch 1, step 2;"):
         train(frames, "rec", settings, checkpoint=tmp_path / "checkpoint")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_too_little_device_memory_names_the_setting_that_lowers_it(frames: Frames) -> None:
+    def progress(done: int, total: int) -> None:
+        raise torch.OutOfMemoryError("tried to allocate 9 GiB")
+
+    where = {"device": "cpu", "checkpoint": None, "log": lambda epoch, losses: None, "progress": progress}
+    with pytest.raises(BadInputError, match=r"too little memory for batch 32.*9 GiB.*lower --encoder.batch"):
+        train_encoder(frames, "rec", 1.0, 0, SETTINGS, FRAMES, **where)
 
 
 def test_what_cannot_be_used_is_refused_with_the_way_out(frames: Frames) -> None:
