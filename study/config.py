@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
+import re
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -50,6 +51,11 @@ def one_of(what: str, got: object, allowed: object) -> BadInputError:
     return BadInputError(f"unknown {what} '{got}'; choose from {names}")
 
 
+def masked(text: str) -> str:
+    """The text with the credentials of any URI in it hidden."""
+    return re.sub(r"(\w://)[^/@\s]*@", r"\1***@", text)
+
+
 class Settings(BaseModel):
     """Frozen, and no setting that is not known."""
 
@@ -67,7 +73,7 @@ class TownSettings(Settings):
 
     rows: Annotated[int, Field(ge=2)] = Field(5, description="rows of the street grid")
     columns: Annotated[int, Field(ge=2)] = Field(5, description="columns of the street grid")
-    block: tuple[Positive, Positive] = Field((60.0, 84.0), description="shortest and longest block [m]")
+    block: tuple[Positive, Positive] = Field((68.0, 92.0), description="shortest and longest block [m]")
     dropped_edges: Annotated[int, Field(ge=0)] = Field(3, description="streets left out of the full grid")
     two_lane_share: Share = Field(0.4, description="share of streets with two lanes each way")
     vehicles: Count = Field(100, description="vehicles in the town (Sec. IV-A: 100)")
