@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from study.config import ACCELERATIONS
 from study.episode import GREEN, RED, YELLOW
-from study.sim.town import LENGTH, WIDTH, Town
+from study.sim.town import LENGTH, WIDTH, Floats, Ints, Pose, Town
 
 DT = 0.1  # [s]
 STEERING_UNIT = 2.4  # wheel angle [rad] of a steering label of one
@@ -34,10 +34,6 @@ SAMPLES = 512  # kept of each vehicle's way
 AHEAD, BEHIND = 70.0, 10.0  # of the vehicle, at least kept [m]
 GAP = 7.5  # of street that a waiting vehicle takes [m]
 GAP_MARGIN = 0.8  # a turning vehicle leaves the crossing lane so long before the other arrives [s]
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -87,6 +83,7 @@ class Fleet:
         self.running = np.zeros(vehicles, bool)  # a yellow that came too late
         self.held = np.zeros(vehicles, bool)  # before a junction that has no room behind it
         self.since = np.zeros(vehicles, np.int64)  # step at which the junction was entered
+        self.braking = np.zeros(vehicles, bool)
         self.brake_until = np.zeros(vehicles, np.int64)
         moves = town.movements
         self.move_exit = np.array([move.exit for move in moves], np.int64)
@@ -107,7 +104,7 @@ class Fleet:
         self.routes[slot], self.starts[slot], self.turns[slot] = [], [], []
         self.ends[slot] = self.sampled[slot] = self.first[slot] = self.filled[slot] = self.at[slot] = 0
         self.s[slot], self.lateral[slot] = s, 0.0
-        self.stopping[slot] = self.running[slot] = self.held[slot] = False
+        self.stopping[slot] = self.running[slot] = self.held[slot] = self.braking[slot] = False
         self.brake_until[slot] = 0
         self.move[slot] = -1
         self._append(slot, strip)
@@ -209,7 +206,7 @@ class Fleet:
     def decide(
         self,
         step: int,
-        pose: tuple[Floats, Floats, Floats, Floats],
+        pose: Pose,
         pairs: tuple[Ints, Ints],
         lights: NDArray[np.uint8],
     ) -> Decisions:
@@ -227,9 +224,9 @@ class Fleet:
         limit = self.limits[self.strip] * 3.6
         ray = np.maximum(0.5, kmh * kmh / 100) + 2
         brake = (kmh >= limit) | self.stopping | (gap < ray)
-        fresh = brake & (step >= self.brake_until)
-        self.brake_until[fresh] = step + self.hold_steps
+        self.brake_until[brake & ~self.braking] = step + self.hold_steps  # from its start, not for as long as it lasts
         brake |= step < self.brake_until
+        self.braking = brake
         low, middle, high = ACCELERATIONS
         acceleration = np.where(brake, low, np.where(kmh >= limit - 10, middle, high))
         error, curvature, wheel = self._steer(heading, speed)
@@ -260,7 +257,7 @@ class Fleet:
         wheel = np.arctan(2 * np.tan(slip)).clip(-MOST_STEERING, MOST_STEERING)
         return error, curvature, wheel
 
-    def _lead(self, pose: tuple[Floats, Floats, Floats, Floats], pairs: tuple[Ints, Ints]) -> tuple[Floats, Ints]:
+    def _lead(self, pose: Pose, pairs: tuple[Ints, Ints]) -> tuple[Floats, Ints]:
         """Free way before each bumper [m], inf beyond LOOK, and who ends it (-1: nobody)."""
         x, y, heading, _ = pose
         i, j = pairs

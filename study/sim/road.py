@@ -15,14 +15,11 @@ from highway_env.road.road import LaneIndex, Road, RoadNetwork
 from highway_env.vehicle.kinematics import Vehicle
 from numpy.typing import NDArray
 
-from study.sim.town import Floats, Town, highway_lane
+from study.sim.town import Floats, Ints, Pose, Town, highway_lane
 
 CELL = 4.0  # of the grid over the town [m]
 KNOWN = 9.0  # lanes this near to a cell's centre are listed with it [m]
 TIE = 1e-9  # scores nearer than this are settled by highway-env's own arithmetic
-
-Ints = NDArray[np.int64]
-Pose = tuple[Floats, Floats, Floats, Floats]  # x, y [m], heading [rad], speed [m/s]
 
 
 class TownNetwork(RoadNetwork):

@@ -31,6 +31,8 @@ COVER = math.hypot(LENGTH / 6, WIDTH / 2)  # [m]
 SLACK = 0.3  # vehicles do not follow their lines exactly [m]
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Pose = tuple[Floats, Floats, Floats, Floats]  # of all vehicles: x, y [m], heading [rad], speed [m/s]
 Turn = Literal["left", "straight", "right"]
 
 
@@ -115,7 +117,6 @@ class Town:
     signal_of: NDArray[np.int64]
     phases: tuple[int, ...]
     junctions: tuple[int, ...]
-    degrees: tuple[int, ...]
     enter: Floats
     leave: Floats
     opposing: NDArray[np.bool_]
@@ -537,7 +538,6 @@ class _Draft:
             signal_of=signal_of,
             phases=tuple(self.phases),
             junctions=tuple(node for node, degree in enumerate(degrees) if degree >= 3),
-            degrees=tuple(degrees),
             enter=enter,
             leave=leave,
             opposing=opposing,
