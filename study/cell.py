@@ -16,7 +16,7 @@ import pandas as pd
 import torch
 from numpy.typing import NDArray
 
-from study.autoencoder import encode, train_encoder
+from study.autoencoder import check_device, encode, train_encoder
 from study.config import BadInputError, cell_key, encoder_key
 from study.frames import Frames, open_frames
 from study.policy import train_policies
@@ -125,18 +125,10 @@ def run_cell(job: CellJob, log: Log, progress: Progress) -> CellResult:
 
 def choose_device(job: CellJob) -> str:
     """The torch device for a job. Raises BadInputError for one that is not there."""
-    gpus = torch.cuda.device_count()
     if job.device == "auto":
+        gpus = torch.cuda.device_count()
         return f"cuda:{job.slot % gpus}" if gpus else "cpu"
-    try:
-        device = torch.device(job.device)
-    except RuntimeError as error:
-        raise BadInputError(f"unknown device '{job.device}'; choose from auto, cpu, cuda, cuda:0, ...") from error
-    if device.type == "cuda" and (device.index or 0) >= gpus:
-        raise BadInputError(
-            f"device '{job.device}' is not there: this machine has {gpus} CUDA devices; try --device auto"
-        )
-    return str(device)
+    return str(check_device(job.device))
 
 
 def device_name(device: str) -> str:

@@ -13,7 +13,7 @@ from pathlib import Path
 import optuna
 from optuna.trial import TrialState
 
-from study.config import BadInputError, Cell
+from study.config import BadInputError, Cell, masked
 
 DEFAULT_QUEUE = "sqlite:///mlruns/queue.db"
 PARAMETER = "cell"
@@ -43,7 +43,9 @@ class Queue:
                 study_name=name, storage=storage, direction="maximize", load_if_exists=True
             )
         except Exception as error:  # whatever the database driver raises
-            raise BadInputError(f"cannot open the queue {storage}: {error}; move the file away or repair it") from error
+            raise BadInputError(
+                f"cannot open the queue {masked(storage)}: {masked(str(error))}; move the file away or repair it"
+            ) from error
 
     def plan(self, wanted: Sequence[str]) -> None:
         """Make exactly the wanted keys wait. To be called by the one process that asks.

@@ -12,13 +12,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from study.command import Parser, run
-from study.config import SWEEPS, named_files
+from study.config import DEFAULT_TRACKING, SWEEPS, named_files
 
 if TYPE_CHECKING:  # the command answers --help without the libraries that only a report needs
     from study.result import SweepRecord
     from study.tracking import Tracker
 
-DEFAULT_TRACKING = "sqlite:///mlruns/mlflow.db"
 TEMPLATE = Path(__file__).with_name("report.typ")
 
 

@@ -106,6 +106,10 @@ def main(args: Sequence[str]) -> int:
         raise BadInputError("--json goes with --dry-run; add --dry-run")
     if options.workers < 1:
         raise BadInputError(f"--workers is {options.workers}; it must be 1 or more")
+    if options.device not in {"auto", "cpu"}:
+        from study.autoencoder import check_device  # noqa: PLC0415 - loads torch, which only a named GPU needs here
+
+        check_device(options.device)
     if options.dry_run:
         return dry_run(plan, options.tracking, as_json=options.json)
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # a batch system's stop ends as cleanly as Ctrl-C

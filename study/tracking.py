@@ -34,7 +34,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from study.config import BadInputError, Cell, Grid, StudySettings, content_key
+from study.config import DEFAULT_TRACKING, BadInputError, Cell, Grid, StudySettings, content_key, masked
 from study.result import ARRAYS, NO_SEED, CellResult, SweepRecord
 
 # Nothing phones home, nothing is printed. A lost server is asked again for about half a minute, MLflow's own default
@@ -57,7 +57,6 @@ from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore  # noqa: E402
 from mlflow.tracking import MlflowClient  # noqa: E402
 from sqlalchemy.exc import SQLAlchemyError  # noqa: E402 - comes with mlflow, which lets its errors through
 
-DEFAULT_URI = "sqlite:///mlruns/mlflow.db"
 SQLITE = "sqlite:///"
 SCHEMES = ("sqlite:///", "http://", "https://", "postgresql://", "postgresql+psycopg2://", "postgresql+psycopg://")
 PROBE = 3.0  # [s] a server has to answer when a tracker is opened
@@ -155,11 +154,13 @@ class Tracker:
     Every method raises TrackerLostError, a BadInputError, when the store stops answering.
     """
 
-    def __init__(self, uri: str = DEFAULT_URI, experiment: str = "study") -> None:
+    def __init__(self, uri: str = DEFAULT_TRACKING, experiment: str = "study") -> None:
         """Open the store and create what is missing. Raises BadInputError when it is not there or not MLflow's."""
         self.uri = masked(uri)
         if not uri.startswith(SCHEMES) or uri == SQLITE:
-            raise BadInputError(f"tracking URI '{self.uri}' cannot be used; give {DEFAULT_URI} or http://host:port")
+            raise BadInputError(
+                f"tracking URI '{self.uri}' cannot be used; give {DEFAULT_TRACKING} or http://host:port"
+            )
         folder = None
         self._lock: Path | None = None
         if uri.startswith(SQLITE):
@@ -171,7 +172,7 @@ class Tracker:
         elif uri.startswith("http"):
             _probe(uri, self.uri)
         else:
-            folder = Path(DEFAULT_URI.removeprefix(SQLITE)).absolute().parent / "artifacts"
+            folder = Path(DEFAULT_TRACKING.removeprefix(SQLITE)).absolute().parent / "artifacts"
         with self._guard(opening=True), _few_tries():
             self.client = MlflowClient(uri)
             self.experiment = self._open_experiment(experiment, folder)
@@ -566,11 +567,6 @@ def points(curves: pd.DataFrame) -> Iterator[Point]:
 # --- plain values ---------------------------------------------------------------------------------------------------
 
 
-def masked(text: str) -> str:
-    """The text with the credentials of any URI in it hidden."""
-    return re.sub(r"(\w://)[^/@\s]*@", r"\1***@", text)
-
-
 def _short(text: str) -> str:
     return text if len(text) <= VALUE_LIMIT else f"{text[: VALUE_LIMIT - 40]}... [{len(text)} characters, cut]"
 
@@ -688,7 +684,7 @@ def _probe(uri: str, shown: str) -> None:
         reason = getattr(error, "reason", error)
         raise TrackerLostError(
             f"the tracking server {shown} does not answer ({reason}); start it (mlflow server), "
-            f"check the address, or leave --tracking out to use {DEFAULT_URI}"
+            f"check the address, or leave --tracking out to use {DEFAULT_TRACKING}"
         ) from None
 
 
