@@ -33,6 +33,8 @@ SPACING = 0.5  # of the samples of a planned way [m]
 SAMPLES = 512  # kept of each vehicle's way
 AHEAD, BEHIND = 70.0, 10.0  # of the vehicle, at least kept [m]
 GAP = 7.5  # of street that a waiting vehicle takes [m]
+AT_LINE = 5.0  # a vehicle this near to its stop line is the first of its queue [m]
+NEVER = 2**62  # a step that does not come
 GAP_MARGIN = 0.8  # a turning vehicle leaves the crossing lane so long before the other arrives [s]
 
 
@@ -82,6 +84,7 @@ class Fleet:
         self.stopping = np.zeros(vehicles, bool)  # for the light ahead
         self.running = np.zeros(vehicles, bool)  # a yellow that came too late
         self.held = np.zeros(vehicles, bool)  # before a junction that has no room behind it
+        self.denied = np.full(vehicles, NEVER)  # step at which that first kept it from using its green
         self.since = np.zeros(vehicles, np.int64)  # step at which the junction was entered
         self.braking = np.zeros(vehicles, bool)
         self.brake_until = np.zeros(vehicles, np.int64)
@@ -106,6 +109,7 @@ class Fleet:
         self.s[slot], self.lateral[slot] = s, 0.0
         self.stopping[slot] = self.running[slot] = self.held[slot] = self.braking[slot] = False
         self.brake_until[slot] = 0
+        self.denied[slot] = NEVER
         self.move[slot] = -1
         self._append(slot, strip)
         self._lengthen(slot)
@@ -189,6 +193,7 @@ class Fleet:
         for slot in np.flatnonzero(self.s - LENGTH / 2 > self.move_end).tolist():
             self._next_turn(slot)
             self.running[slot] = self.stopping[slot] = self.held[slot] = False
+            self.denied[slot] = NEVER
         short = (self.first + self.filled) * SPACING < self.s + AHEAD
         for slot in np.flatnonzero(short | (self.strip_end + 40 > self.ends)).tolist():
             self._lengthen(slot)
@@ -219,7 +224,7 @@ class Fleet:
         front = self.s + LENGTH / 2 - self.move_start  # of the bumper, from the stop line; -inf without a light
         state = self._heed_lights(front, speed, lights)
         crossing = self._right_of_way(step, front, speed, state, lead_gap, lead)
-        gap = np.minimum(np.minimum(lead_gap, crossing), self._room_behind(front, speed))
+        gap = np.minimum(np.minimum(lead_gap, crossing), self._room_behind(step, front, speed, state))
         kmh = speed * 3.6
         limit = self.limits[self.strip] * 3.6
         ray = np.maximum(0.5, kmh * kmh / 100) + 2
@@ -343,8 +348,12 @@ class Fleet:
             np.minimum.at(gap, i[where], distance[where] - front[i[where]])
         return gap
 
-    def _room_behind(self, front: Floats, speed: Floats) -> Floats:
-        """Distance to the stop line [m] for those whose street behind the junction is full, inf for the others."""
+    def _room_behind(self, step: int, front: Floats, speed: Floats, state: NDArray[np.uint8]) -> Floats:
+        """Distance to the stop line [m] for those whose street behind the junction is full, inf for the others.
+
+        Who could not enter at green goes before others into the same street; or the rhythm of two junctions may let
+        one approach fill it, green after green, and keep another waiting.
+        """
         room = self.street_length.copy()
         np.minimum.at(room, self.strip, self.s - self.strip_start - LENGTH / 2 + speed * speed / (2 * BRAKE))
         ruled = self.move >= 0
@@ -354,7 +363,13 @@ class Fleet:
         way_out = self.move_exit[self.move]
         coming = ruled & (front > 0) & (self.strip != way_out)
         taken = np.bincount(way_out[coming], minlength=len(room))
-        self.held = ruled & (front <= 0) & (room[way_out] < GAP * (taken[way_out] + 1))
+        before = ruled & (front <= 0)
+        queue = np.full(len(room), NEVER)
+        np.minimum.at(queue, way_out[before], self.denied[before])
+        full = room[way_out] < GAP * (taken[way_out] + 1)
+        self.held = before & (full | (queue[way_out] < self.denied))
+        fresh = self.held & (state == GREEN) & (front > -AT_LINE) & (self.denied == NEVER)
+        self.denied[fresh] = step
         gap[self.held] = -front[self.held]
         return gap
 
