@@ -225,3 +225,28 @@ def test_nobody_enters_a_junction_that_has_no_room_behind_it() -> None:
         road.step(DT)
     assert road.vehicles[0].speed < 0.1
     assert road.fleet.s[0] + LENGTH / 2 <= road.fleet.move_start[0]
+
+
+def test_who_was_denied_its_green_goes_first_into_the_same_street() -> None:
+    road = make_traffic(TownSettings(vehicles=2), 0)
+    moves = road.town.movements
+    denied, greedy = next(
+        (a, b)
+        for a, one in enumerate(moves)
+        for b, other in enumerate(moves)
+        if one.exit == other.exit and (one.arm - other.arm) % 2 and road.town.phases[one.node]
+    )
+    send(road, 0, denied, 5.0, 0.0)
+    send(road, 1, greedy, 5.0, 0.0)
+    until_green(road, greedy)
+    road.fleet.denied[0] = 0
+    entered: list[int] = []
+    for _ in range(400):
+        road.act()
+        road.step(DT)
+        for slot in (0, 1):
+            if slot not in entered and road.fleet.s[slot] > road.fleet.move_start[slot]:
+                entered.append(slot)
+        if len(entered) == 2:
+            break
+    assert entered == [0, 1]

@@ -133,7 +133,9 @@ def test_the_map_has_junctions_lights_over_its_lanes_and_every_kind_of_border(ep
 def test_the_drive_of_a_seed_is_the_one_that_its_format_version_stands_for() -> None:
     """Change FORMAT_VERSIONS["episodes"] with this digest, or drives of old and new code pass for the same."""
     town = TownSettings(rows=3, columns=4, dropped_edges=1, vehicles=20)
-    tiny = record_episode(town, RecordingSettings(warm_up=1.0, duration=20.0), 1)  # long enough to meet every rule
+    tiny = record_episode(
+        town, RecordingSettings(warm_up=1.0, duration=20.0), 1
+    )  # long enough for lights, queues and crossings
     rounded = [np.round(getattr(tiny, name), 2) + 0.0 for name in ("x", "y", "speed", "acceleration")]
     digest = hashlib.sha256(b"".join(values.tobytes() for values in rounded)).hexdigest()
     assert (FORMAT_VERSION, digest[:16]) == (1, "8680b67d8d004c19")
