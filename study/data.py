@@ -27,14 +27,16 @@ def prepare(settings: StudySettings, root: Path, processes: int, progress: Progr
     """The frame store's folder, after recording and rendering whatever is missing.
 
     `progress(stage, done, total)` with stage "record" (drives) or "render" (frames).
-    Raises BadInputError when the settings cannot be met or the disk is too small.
+    Raises BadInputError when the settings cannot be met, the disk is too small or the store there is damaged.
     """
     folder = frames_folder(settings, root)
+    # Imported here: planning needs no arrays, and frames that exist can be studied on a machine without the simulator.
+    from study.frames import build_frames, open_frames  # noqa: PLC0415
+
     if (folder / "manifest.json").is_file():
+        open_frames(folder, check=True)  # a store that was damaged since is told now, not by every cell
         return folder
     _check_room(settings, root)
-    # The simulator is imported only here: frames that exist can be studied on a machine without it.
-    from study.frames import build_frames  # noqa: PLC0415
     from study.sim.record import record_all  # noqa: PLC0415
 
     recording = settings.recording

@@ -166,7 +166,8 @@ class Fleet:
         at = int(self.at[slot])
         self.strip[slot] = self.routes[slot][at]
         self.strip_start[slot] = self.starts[slot][at]
-        self.strip_end[slot] = self.starts[slot][at + 1]
+        # Not the next strip's start: the way may not be planned that far yet.
+        self.strip_end[slot] = self.starts[slot][at] + self.street_length[self.routes[slot][at]]
 
     def _next_turn(self, slot: int) -> None:
         if self.turns[slot]:

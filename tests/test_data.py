@@ -1,0 +1,70 @@
+"""The data stage: from nothing to a frame store, once."""
+
+import shutil
+from types import SimpleNamespace
+
+import pytest
+
+from study.config import BadInputError, load_profile
+from study.data import frames_folder, prepare
+from study.frames import open_frames
+
+TINY = {
+    "town": {"vehicles": 30},
+    "recording": {"warm_up": 1, "duration": 4, "encoder_episodes": 2, "policy_episodes": 2},
+    "frames": {"encoder": 20, "policy": 20},
+}
+
+
+@pytest.fixture(scope="module")
+def settings():
+    return load_profile("smoke", TINY)
+
+
+@pytest.fixture(scope="module")
+def root(settings, tmp_path_factory):
+    made = tmp_path_factory.mktemp("data")
+    prepare(settings, made, 1, lambda *_: None)
+    return made
+
+
+def test_the_two_sets_come_from_different_drives(settings, root):
+    store = open_frames(frames_folder(settings, root), check=True)
+    sources = [{source["name"] for source in store.manifest["sources"][name]} for name in ("encoder", "policy")]
+    assert not sources[0] & sources[1]
+    assert [len(found) for found in sources] == [2, 2]
+
+
+def test_what_is_there_is_not_made_again(settings, root):
+    told = []
+    prepare(settings, root, 1, lambda *what: told.append(what))
+    assert told == []
+
+
+def test_progress_reaches_the_end(settings, tmp_path):
+    told = []
+    prepare(settings, tmp_path, 1, lambda *what: told.append(what))
+    assert [stage for stage, done, whole in told if done == whole] == ["record", "render"]
+
+
+def test_a_damaged_store_is_told(settings, root, tmp_path):
+    shutil.copytree(root, tmp_path / "data")
+    images = frames_folder(settings, tmp_path / "data") / "encoder" / "images.npy"
+    content = bytearray(images.read_bytes())
+    content[-1] ^= 255
+    images.write_bytes(content)
+    with pytest.raises(BadInputError, match=r"images\.npy"):
+        prepare(settings, tmp_path / "data", 1, lambda *_: None)
+
+
+def test_a_full_disk_is_told_before_anything_is_made(settings, tmp_path, monkeypatch):
+    monkeypatch.setattr("study.data.shutil.disk_usage", lambda _: SimpleNamespace(free=1000))
+    with pytest.raises(BadInputError, match="free"):
+        prepare(settings, tmp_path, 1, lambda *_: None)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_cannot_be_made_is_told(settings, tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(BadInputError, match="cannot write"):
+        prepare(settings, tmp_path / "file" / "data", 1, lambda *_: None)
