@@ -250,3 +250,8 @@ def test_who_was_denied_its_green_goes_first_into_the_same_street() -> None:
         if len(entered) == 2:
             break
     assert entered == [0, 1]
+
+
+def test_a_vehicle_may_enter_the_last_street_of_its_plan() -> None:
+    """In this town a vehicle does so: plans end at the lights, and a street may be longer than the way looked at."""
+    assert drive(22, 340).speed.shape == (340, 100)
