@@ -1,15 +1,22 @@
 """The data stage: drives from the town (Sec. IV-A), then the frame store that the cells read.
 
 Both products carry their key in their path, so what is there is used again.
+
+python -m study.data build --profile laptop
+python -m study.data card
+python -m study.data preview
 """
 
 from __future__ import annotations
 
+import argparse
+import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from study.config import BadInputError, StudySettings, frames_key, recording_key
+from study.command import Parser, add_options, run, study_overrides
+from study.config import SWEEPS, BadInputError, StudySettings, frames_key, load_profile, named_files, recording_key
 from study.cost import data_cost, size
 
 DATA = Path("data")
@@ -79,3 +86,44 @@ def _check_room(settings: StudySettings, root: Path) -> None:
             f"{root} has {size(free)} free and the data needs about {size(need)}: "
             "free some room, or lower --frames.encoder and --recording.encoder_episodes"
         )
+
+
+# --- the command ----------------------------------------------------------------------------------------------------
+
+
+def parser() -> Parser:
+    """The command line."""
+    made = Parser(
+        prog="study.data",
+        usage="python -m study.data {build,card,preview} [--profile P] [--group.setting VALUE ...]",
+        description="Make the data of a study, describe it, and show it.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog="build    record the drives and render the frames, whatever of them is missing\n"
+        "card     what is in the data: PNG and text beside the frame store\n"
+        "preview  pictures of frames, and an animated drive, beside the frame store",
+    )
+    made.add_argument("action", choices=("build", "card", "preview"), help="what to do (below)")
+    made.add_argument(
+        "--profile", default="laptop", help=f"{', '.join(named_files(SWEEPS / 'profiles'))} (default: laptop)"
+    )
+    made.add_argument("--processes", type=int, default=os.cpu_count() or 1, metavar="N", help="default: all cores")
+    add_options(made, StudySettings)
+    return made
+
+
+def main(args: Sequence[str]) -> int:
+    """Run the command and return its exit code."""
+    options = parser().parse(args)
+    settings = load_profile(options.profile, study_overrides(options))
+    if options.processes < 1:
+        raise BadInputError(f"--processes is {options.processes}; it must be 1 or more")
+    from study.display import Display  # noqa: PLC0415
+
+    with Display(f"data ({options.profile})", {}, {}, data_cost(settings).seconds) as display:
+        folder = prepare(settings, DATA, options.processes, display.data)
+    print(folder)
+    return 0
+
+
+if __name__ == "__main__":
+    run(main)
