@@ -388,6 +388,15 @@ def test_a_checkpoint_of_another_configuration_is_refused(frames: Frames, tmp_pa
         train(other, "rec", checkpoint=path)
 
 
+@pytest.mark.usefixtures("every_step")
+def test_a_checkpoint_serves_settings_that_make_no_difference(frames: Frames, tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint"
+    first = train(frames, "rec", checkpoint=path)
+    other = SETTINGS.model_copy(update={"budget": "steps", "head_weights": {"rec": 1.0, "pred": 9.0}})
+    again = train(frames, "rec", checkpoint=path, settings=other)
+    assert all(np.array_equal(first.weights[name], again.weights[name]) for name in first.weights)
+
+
 def test_a_broken_checkpoint_is_refused(frames: Frames, tmp_path: Path) -> None:
     path = tmp_path / "checkpoint"
     train(frames, "rec", checkpoint=path)
