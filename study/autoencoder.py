@@ -533,7 +533,7 @@ def train_encoder(
         "device": target.type,
         "frames_an_epoch": plan.frames_an_epoch,
         # As in the encoder's key, a setting that makes no difference here must not refuse a checkpoint.
-        "head_weights": {head: settings.head_weights.get(head, 1.0) for head in HEAD_SETS[heads]},
+        "weights": {head: settings.head_weights.get(head, 1.0) for head in HEAD_SETS[heads]},
         **settings.model_dump(mode="json", exclude={"precision", "budget", "head_weights"}),
     }
     course = _Course(module, plan, training, checkpoint, log, progress)
