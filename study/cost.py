@@ -11,16 +11,16 @@ from dataclasses import dataclass
 from study.config import HEAD_SETS, IMAGE, Cell, StudySettings
 
 STEP_HZ = 10
-VEHICLE_FRAMES_PER_S = 12_000.0  # simulated, on two cores
-FRAMES_PER_S = 3_000.0  # rendered, on two cores
-ENCODER_IMAGE_S = 1 / 2600  # an image forward and backward through the encoder
-HEAD_IMAGE_S = 1 / 2700  # the same for each head
+VEHICLE_FRAMES_PER_S = 90_000.0  # simulated, on two cores
+FRAMES_PER_S = 6_000.0  # chosen and rendered, on two cores
+ENCODER_IMAGE_S = 1 / 3700  # an image forward and backward through the encoder
+HEAD_IMAGE_S = 1 / 3800  # the same for each head
 TEST_COST = 0.35  # an image evaluated, as a share of an image trained
-POLICY_FRAME_S = 1 / 190_000  # a frame forward and backward through one policy
+POLICY_FRAME_S = 1 / 280_000  # a frame forward and backward through one policy
 CELL_START_S = 10.0  # a process starts, imports torch and opens the data; a result is committed
 
 FRAME_BYTES = IMAGE * IMAGE * 3 + 2 * IMAGE * IMAGE // 8 + 40  # image, two bit masks, labels
-STATE_BYTES = 22  # of one vehicle at one step in an Episode
+STATE_BYTES = 32  # of one vehicle at one step in an Episode
 RESULT_BYTES = 12_000_000  # weights, curves, samples and predictions of a cell, with its share of the tracking store
 
 
