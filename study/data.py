@@ -122,7 +122,18 @@ def main(args: Sequence[str]) -> int:
     with Display(f"data ({options.profile})", {}, {}, data_cost(settings).seconds) as display:
         folder = prepare(settings, DATA, options.processes, display.data)
     print(folder)
+    if options.action == "card":
+        _describe(settings, folder)
     return 0
+
+
+def _describe(settings: StudySettings, folder: Path) -> None:
+    from study.card import source_drives, write_card  # noqa: PLC0415
+    from study.frames import open_frames  # noqa: PLC0415
+
+    store = open_frames(folder)
+    files = write_card(store, source_drives(store, DATA / "episodes" / recording_key(settings)), folder)
+    print(files[1].read_text(encoding="utf-8"), *files, sep="\n")
 
 
 if __name__ == "__main__":

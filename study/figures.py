@@ -80,6 +80,12 @@ def save(figure: Figure, folder: Path, name: str) -> tuple[Path, Path]:
     return paths[0], paths[1]
 
 
+def write_png(figure: Figure, path: Path) -> None:
+    """Write a figure as one PNG (200 dots per inch), the same bytes each time."""
+    with mpl.rc_context(STYLE):
+        figure.savefig(path, format="png", dpi=200, metadata={"Software": None})
+
+
 def _figure(height: float, columns: int = 1, rows: int = 1) -> tuple[Figure, list[Axes]]:
     figure = Figure(figsize=(WIDTH, height), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False)
@@ -397,3 +403,105 @@ def _strip(pictures: NDArray[np.uint8], larger: int = 3, gap: int = 8) -> NDArra
     framed = np.pad(colour, ((0, 0), (0, gap), (0, gap), (0, 0)), constant_values=255)
     strip: NDArray[np.uint8] = np.concatenate(list(framed), axis=1)
     return strip
+
+
+# --- data -----------------------------------------------------------------------------------------------------------
+
+SET_COLOUR = {"encoder": "#0072B2", "policy": "#D55E00"}
+SPLIT_COLOUR = {"episode": "#009E73", "frame": "#CC79A7"}
+SPLIT_LINE = {"episode": "-", "frame": "--"}
+
+
+def data_card(card: Mapping[str, Any]) -> Figure:
+    """The numbers of `study.card.make_card` in six panels: labels before and after selection, traffic, twins."""
+    sets = card["sets"]
+    with mpl.rc_context(STYLE):
+        figure, panels = _figure(4.9, columns=3, rows=2)
+        edges = sets["policy"]["chosen"]["all"]["steering_edges"]
+        names = [f"< {edges[0]:g}", *(f"to {edge:g}" for edge in edges[1:]), f"> {edges[-1]:g}"]
+        _shares(panels[0], "(a) Steering", _rows(sets, "steering"), names)
+        panels[0].tick_params(axis="x", rotation=55)
+        _shares(panels[1], "(b) Command", _rows(sets, "acceleration"), [f"{value:g}" for value in ACCELERATIONS])
+        lights = {
+            label: ([part["light"][1], part["light"][2], part["standing"]], part["frames"], colour, filled)
+            for label, part, colour, filled in _parts(sets)
+        }
+        _shares(panels[2], "(c) Lights, standing", lights, ["yellow", "red", "standing"])
+        panels[0].set_ylabel("share of frames [%]")
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
+        _in_view(panels[3], sets)
+        for panel, (letter, name) in zip(panels[4:], (("e", "encoder"), ("f", "policy")), strict=True):
+            twins = sets[name]["twins"]
+            _distances(panel, twins, f"({letter}) Twins, {name} set, n = {twins['frame']['asked']:,}")
+        panels[4].set_ylabel("test frames with a nearer one [%]")
+        figure.suptitle(_headline(card), x=0.01, ha="left", fontsize=7.5)
+    return figure
+
+
+def _headline(card: Mapping[str, Any]) -> str:
+    drives = card["drives"]
+    frames = " + ".join(f"{entry['frames']:,} {name}" for name, entry in card["sets"].items())
+    first = f"{frames} frames of {drives['used']} drives, split by {card['split']} (store {card['key']})"
+    if "towns" not in drives:
+        return first
+    return (
+        f"{first}\n{drives['towns']} towns, {drives['hours']:.2f} h of traffic, {drives['vehicles']:,} vehicles, "
+        f"{drives['vehicle_hours']:.1f} vehicle hours, {drives['vehicle_km']:,.0f} vehicle km"
+    )
+
+
+_Shares = dict[str, tuple[list[int], int, str, bool]]  # label -> counts, of how many, colour, filled
+
+
+def _parts(sets: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any], str, bool]]:
+    return [
+        (f"{name}, {state}", part, SET_COLOUR[name], state == "chosen")
+        for name, entry in sets.items()
+        for state, part in (("candidates", entry["candidates"]), ("chosen", entry["chosen"]["all"]))
+    ]
+
+
+def _rows(sets: Mapping[str, Any], key: str) -> _Shares:
+    return {label: (part[key], part["frames"], colour, filled) for label, part, colour, filled in _parts(sets)}
+
+
+def _shares(axes: Axes, title: str, rows: _Shares, names: Sequence[str]) -> None:
+    """Bars side by side: outlined before selection, filled after."""
+    wide = 0.8 / len(rows)
+    for index, (label, (counts, whole, colour, filled)) in enumerate(rows.items()):
+        axes.bar(
+            np.arange(len(names)) + (index - (len(rows) - 1) / 2) * wide,
+            100 * np.array(counts) / max(whole, 1),
+            0.9 * wide,
+            label=label,
+            facecolor=colour if filled else "none",
+            edgecolor=colour,
+            linewidth=0.6,
+        )
+    axes.set_xticks(range(len(names)), names)
+    axes.set_title(title)
+
+
+def _in_view(axes: Axes, sets: Mapping[str, Any]) -> None:
+    for name, entry in sets.items():
+        seen = entry["agents_in_view"]
+        if seen["frames"]:
+            label = f"{name} (n = {seen['frames']:,})"
+            shares = 100 * np.array(seen["counts"]) / seen["frames"]
+            axes.plot(range(len(shares)), shares, color=SET_COLOUR[name], marker="o", label=label)
+            axes.legend(frameon=False, fontsize=6, handlelength=1.5)
+    axes.set_ylim(0, 1.25 * axes.get_ylim()[1])
+    axes.set_title("(d) Other vehicles in view")
+    axes.set_xlabel("vehicles")
+    axes.set_ylabel("share of frames [%]")
+
+
+def _distances(axes: Axes, twins: Mapping[str, Any], title: str) -> None:
+    for name, colour in SPLIT_COLOUR.items():
+        within = 100 * np.array(twins[name]["within"])
+        axes.plot(range(len(within)), within, SPLIT_LINE[name], color=colour, label=f"split: {name}")
+    axes.set_ylim(0, 100)
+    axes.set_xlim(0, len(twins["frame"]["within"]) - 1)
+    axes.set_title(title)
+    axes.set_xlabel("distance to nearest training frame\n[rms grey levels of 255]")
+    axes.legend(frameon=False, fontsize=6, handlelength=2.2, loc="lower right")

@@ -34,6 +34,7 @@ from study.config import (
     load_profile,
     named_files,
     parameter_counts,
+    recording_key,
 )
 from study.cost import Cost, cell_cost, clock, data_cost, size, total
 from study.data import DATA, frames_folder, prepare
@@ -238,6 +239,13 @@ def execute(plan: Plan, options: argparse.Namespace) -> int:
             for key in waiting
         }
         try:
+            if data:
+                from study.card import card_files, source_drives  # noqa: PLC0415
+                from study.frames import open_frames  # noqa: PLC0415
+
+                store = open_frames(frames)
+                drives = source_drives(store, DATA / "episodes" / recording_key(plan.settings))
+                tracker.log_files(sweep_run, card_files(store, drives, frames), "data")
             with Workers(jobs, options.workers, tracker, sweep_run, queue, display) as workers:
                 failed = workers.run()
             status = "FAILED" if failed else "FINISHED"

@@ -14,7 +14,7 @@ LAYERS = [
     {"autoencoder", "policy", "stats"},
     {"cell", "claims"},
     {"tracking", "grid", "figures", "display", "summary"},
-    {"drawings"},
+    {"drawings", "card"},
     {"data", "report", "worker"},
     {"sweep"},
 ]

@@ -1,0 +1,116 @@
+"""The data card: numbers, text and figure of a frame store and its drives."""
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from drives import write_drives
+from study.birdview import MASK_BYTES
+from study.card import _others, _twins, card_files, card_text, make_card, nearest_frames, thumbnails, write_card
+from study.config import BirdviewSettings, FramesSettings
+from study.episode import read_episode
+from study.frames import Frames, build_frames, open_frames
+
+VIEW = BirdviewSettings()
+
+
+@pytest.fixture(scope="module")
+def drives(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("drives")
+    return write_drives(folder / "a", 3) + write_drives(folder / "b", 3, first_seed=10)
+
+
+@pytest.fixture(scope="module")
+def folder(drives, tmp_path_factory):
+    made = tmp_path_factory.mktemp("frames") / "store"
+    build_frames(FramesSettings(encoder=60, policy=40), VIEW, drives[:3], drives[3:], made, 1)
+    return made
+
+
+def pictures(count, seed=0):
+    return np.random.default_rng(seed).integers(0, 256, (count, 64, 64, 3)).astype(np.uint8)
+
+
+def test_the_traffic_is_that_of_the_drives(folder, drives):
+    episodes = [read_episode(path) for path in drives]
+    said = make_card(open_frames(folder), drives)["drives"]
+    seconds = sum(episode.steps / 10 for episode in episodes)
+    metres = sum(float(episode.speed[episode.present].sum()) / 10 for episode in episodes)
+    assert said["used"] == said["here"] == said["seeds"] == 6
+    assert said["towns"] == 1  # one crossing for all
+    assert said["vehicles"] == 72
+    assert said["hours"] == pytest.approx(seconds / 3600, abs=1e-4)
+    assert said["vehicle_km"] == pytest.approx(metres / 1000, abs=0.006)
+
+
+def test_the_same_store_gives_the_same_bytes(folder, drives):
+    files = write_card(open_frames(folder), drives, folder)
+    first = [file.read_bytes() for file in files]
+    assert [file.read_bytes() for file in write_card(open_frames(folder), drives[::-1], folder)] == first
+    assert sorted(path.name for path in (folder / "card").iterdir()) == ["card.json", "card.png", "card.txt"]
+    assert not list(folder.glob(".card*"))
+
+
+def test_a_card_that_is_there_is_not_made_again(folder, drives):
+    files = card_files(open_frames(folder), drives, folder)
+    before = [file.stat().st_mtime_ns for file in files]
+    assert [file.stat().st_mtime_ns for file in card_files(open_frames(folder), drives, folder)] == before
+
+
+def test_a_store_whose_drives_are_gone_still_has_a_card(folder, tmp_path):
+    store = open_frames(folder)
+    card = make_card(store, [])
+    assert card["drives"] == {"used": 6, "here": 0}
+    assert "none of them here" in card_text(card)
+    assert len(write_card(store, [], tmp_path)) == 3
+
+
+def test_the_text_names_every_share_and_how_many_were_counted(folder, drives):
+    card = make_card(open_frames(folder), drives)
+    text = card_text(card)
+    for words in ("standing", "light red", "command -1", "before selection", "other vehicles in view", "split: frame"):
+        assert text.count(words) == 2  # once for each set
+    assert f"n = {card['sets']['encoder']['agents_in_view']['frames']} frames" in text
+    json.dumps(card, allow_nan=False)
+
+
+def test_agents_in_view_are_those_whose_centre_is_painted(drives):
+    """Counted again by hand: turned into the ego's frame with complex numbers."""
+    episode = read_episode(drives[0])
+    labels = pd.DataFrame({"step": [12, 40, 60], "agent": [100, 103, 107]})
+    expected = []
+    for step, agent in labels.itertuples(index=False):
+        place = episode.x[step] + 1j * episode.y[step]
+        ego = [item.id for item in episode.agents].index(agent)
+        seen = (place - place[ego]) * np.exp(-1j * episode.heading[step, ego])
+        expected.append(int(((np.abs(seen.imag) < 20) & (seen.real > -15) & (seen.real < 25)).sum()) - 1)
+    assert _others(labels, drives[0], VIEW.model_dump()) == expected
+    assert max(expected) > 0
+
+
+def test_a_thumbnail_of_one_colour_is_its_grey():
+    images = np.full((3, 64, 64, 3), 1, np.uint8) * np.array([0, 128, 255], np.uint8)[:, None, None, None]
+    assert thumbnails(images, np.arange(3))[:, ::50].tolist() == [[0] * 6, [128] * 6, [255] * 6]
+
+
+def test_the_nearest_frame_is_the_one_a_search_finds():
+    small = thumbnails(pictures(80), np.arange(80))
+    small[5] = small[60]
+    distance, nearest = nearest_frames(small[:20], small[20:])
+    gaps = np.sqrt(((small[:20, None].astype(float) - small[None, 20:]) ** 2).mean(axis=2))
+    np.testing.assert_array_equal(nearest, gaps.argmin(axis=1))
+    np.testing.assert_allclose(distance, gaps.min(axis=1), atol=1e-9)
+    assert (distance[5], nearest[5]) == (0, 40)
+
+
+def test_a_split_by_frame_finds_the_twins_that_a_split_by_drive_keeps_apart():
+    """Five drives that stand still at ten places each: every picture is there eight times, in its drive alone."""
+    shown = np.repeat(pictures(50), 8, axis=0)
+    labels = pd.DataFrame({"episode": np.repeat(np.arange(5), 80)})
+    found = _twins(Frames(shown, np.zeros((400, 2, MASK_BYTES), np.uint8), labels), 0.2, 0)
+    assert found["episode"]["twins"] == found["episode"]["same_drive"] == 0
+    assert found["frame"]["twins"] > 0.95
+    assert found["frame"]["same_drive"] > 0.95
+    assert found["frame"]["test"] == found["episode"]["test"] == 80
