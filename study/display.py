@@ -19,6 +19,7 @@ LINE_EVERY = 15.0  # [s] between two plain lines
 STAGES = {"record": "recording drives", "render": "rendering frames", "encoder": "encoder", "policy": "policies"}
 UNITS = {"record": "drive", "render": "frame", "encoder": "step", "policy": "epoch"}
 ENCODER_SHARE = 0.8  # of a cell's time, where the two stages are not told apart beforehand
+RECORD_SHARE = 0.8  # of the data's time, likewise
 DATA_KEY = ""
 
 
@@ -38,6 +39,7 @@ class Display:
         self._failed = 0
         self._began = self._said = time.monotonic()
         self._resumed: dict[str, float] = {}
+        self._data_since: dict[str, tuple[float, int]] = {}  # data stage -> when it began, and what was there then
         console = Console(file=sys.stderr)
         self._live = Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
 
@@ -52,13 +54,20 @@ class Display:
             self._live.stop()
 
     def data(self, stage: str, done: int, whole: int) -> None:
-        """The data stage has come this far."""
+        """The data stage has come this far; what was there when it began does not count as speed."""
         share = done / max(whole, 1)
-        self._shares[DATA_KEY] = (share + (stage == "render")) / 2
-        self._state[DATA_KEY] = f"{STAGES[stage]} {done:,}/{whole:,}"
+        share = RECORD_SHARE * share if stage == "record" else RECORD_SHARE + (1 - RECORD_SHARE) * share
+        now = time.monotonic()
+        if stage not in self._data_since:
+            self._data_since[stage] = (now, done)
+            self._resumed[DATA_KEY] = self._resumed.get(DATA_KEY, 0.0) + share - self._shares[DATA_KEY]
+        self._shares[DATA_KEY] = share
+        began, there = self._data_since[stage]
+        rate = (done - there) / (now - began) if now > began else 0.0
+        said = f", {rate:,.0f}/s" if rate >= 100 else f", {rate:.2g}/s" if rate else ""
+        self._state[DATA_KEY] = f"{STAGES[stage]} {done:,}/{whole:,}{said}"
         if stage == "render" and done == whole:
             self._state.pop(DATA_KEY)
-            self._shares[DATA_KEY] = 1.0
         self.tick()
 
     def start(self, key: str) -> None:

@@ -44,3 +44,13 @@ def test_plain_lines_count_the_cells(clock, capsys):
     assert "1 of 3 cells finished" in err
     assert "rec 100% e0: finished; cells 2/3" in err
     assert "full 100% e0: FAILED; cells 2/3, 1 failed" in err
+
+
+def test_the_data_line_tells_rate_and_time_left(clock, capsys):
+    """Half of the drives were there before this start: only the others count as speed."""
+    with Display("data (smoke)", {}, {}, 100.0) as display:
+        display.data("record", 50, 100)
+        clock[0] += 40
+        display.data("record", 75, 100)
+        assert display.left() == pytest.approx(80)
+    assert "recording drives 75/100, 0.62/s" in capsys.readouterr().err
