@@ -122,18 +122,26 @@ def main(args: Sequence[str]) -> int:
     with Display(f"data ({options.profile})", {}, {}, data_cost(settings).seconds) as display:
         folder = prepare(settings, DATA, options.processes, display.data)
     print(folder)
-    if options.action == "card":
-        _describe(settings, folder)
+    if options.action != "build":
+        _show(options.action, settings, folder)
     return 0
 
 
-def _describe(settings: StudySettings, folder: Path) -> None:
+def _show(action: str, settings: StudySettings, folder: Path) -> None:
+    """Make the card or the preview anew."""
     from study.card import source_drives, write_card  # noqa: PLC0415
     from study.frames import open_frames  # noqa: PLC0415
 
     store = open_frames(folder)
-    files = write_card(store, source_drives(store, DATA / "episodes" / recording_key(settings)), folder)
-    print(files[1].read_text(encoding="utf-8"), *files, sep="\n")
+    drives = source_drives(store, DATA / "episodes" / recording_key(settings))
+    if action == "card":
+        files = write_card(store, drives, folder)
+        print(files[1].read_text(encoding="utf-8"))
+    else:
+        from study.preview import write_preview  # noqa: PLC0415
+
+        files = write_preview(store, drives, folder)
+    print(*files, sep="\n")
 
 
 if __name__ == "__main__":

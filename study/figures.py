@@ -505,3 +505,26 @@ def _distances(axes: Axes, twins: Mapping[str, Any], title: str) -> None:
     axes.set_title(title)
     axes.set_xlabel("distance to nearest training frame\n[rms grey levels of 255]")
     axes.legend(frameon=False, fontsize=6, handlelength=2.2, loc="lower right")
+
+
+def contact_sheet(sets: Mapping[str, Sequence[tuple[str, NDArray[np.uint8]]]], columns: int = 3) -> Figure:
+    """Frames of each set as strips of input, pred and plan, [3, 64, 64, 3] uint8 each, with a text below."""
+    side, words, head = WIDTH / columns / 3.15, 0.27, 0.3  # [in]
+    lines = {name: -(-len(frames) // columns) for name, frames in sets.items()}
+    height = sum(head + rows * (side + words) for rows in lines.values())
+    figure, top = Figure(figsize=(WIDTH, height)), height
+    with mpl.rc_context(STYLE):
+        for name, frames in sets.items():
+            title = f"{name} set, training frames: input, pred (the others' next second), plan (the ego's)"
+            figure.text(0, (top - 0.18) / height, title, fontsize=8)
+            top -= head
+            for index, (text, pictures) in enumerate(frames):
+                row, column = divmod(index, columns)
+                left, low = column * WIDTH / columns, top - row * (side + words) - side
+                place = (left / WIDTH, low / height, 3 * side / WIDTH, side / height)
+                axes = figure.add_axes(place, frame_on=False)
+                axes.imshow(_strip(pictures), interpolation="none", aspect="auto")
+                axes.set_axis_off()
+                figure.text(left / WIDTH, (low - 0.01) / height, text, fontsize=5.5, va="top", linespacing=1.1)
+            top -= lines[name] * (side + words)
+    return figure

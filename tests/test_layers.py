@@ -14,7 +14,7 @@ LAYERS = [
     {"autoencoder", "policy", "stats"},
     {"cell", "claims"},
     {"tracking", "grid", "figures", "display", "summary"},
-    {"drawings", "card"},
+    {"drawings", "card", "preview"},
     {"data", "report", "worker"},
     {"sweep"},
 ]
@@ -29,6 +29,7 @@ OWNERS = {
     "optuna": {"grid"},
     "scipy": {"stats"},
     "matplotlib": {"figures"},
+    "PIL": {"preview"},
     "typst": {"report"},
     "rich": {"display"},
     "argparse": {"command", "sweep", "report", "data"},
