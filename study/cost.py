@@ -32,10 +32,10 @@ class Cost:
     bytes: int
 
 
-def data_cost(settings: StudySettings) -> Cost:
-    """Of recording the drives and rendering the frames."""
+def data_cost(settings: StudySettings, *, recorded: bool = True) -> Cost:
+    """Of recording the drives, unless they are there already, and rendering the frames."""
     recording, frames = settings.recording, settings.frames
-    drives = recording.encoder_episodes + recording.policy_episodes
+    drives = recording.encoder_episodes + recording.policy_episodes if recorded else 0
     steps = drives * settings.town.vehicles * STEP_HZ
     simulated = steps * (recording.warm_up + recording.duration)
     images = frames.encoder + frames.policy

@@ -1,10 +1,12 @@
-"""The data stage: drives from the town (Sec. IV-A), then the frame store that the cells read.
+"""The data stage: drives from the town (Sec. IV-A) or from elsewhere, then the frame store that the cells read.
 
-Both products carry their key in their path, so what is there is used again.
+Drives and frames carry their key in their path, so what is there is used again.
 
 python -m study.data build --profile laptop
 python -m study.data card
 python -m study.data preview
+python -m study.data scenes --out scenes --episodes 30
+python -m study.data import scenes
 """
 
 from __future__ import annotations
@@ -12,12 +14,14 @@ from __future__ import annotations
 import argparse
 import os
 import shutil
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from study.command import Parser, add_options, run, study_overrides
 from study.config import SWEEPS, BadInputError, StudySettings, frames_key, load_profile, named_files, recording_key
 from study.cost import data_cost, size
+from study.imported import Imported, describe, import_drives
 
 DATA = Path("data")
 POLICY_SEED = 1_000_000  # the policy set's drives are numbered from here: never those of the encoder set (Sec. V-A)
@@ -25,25 +29,49 @@ POLICY_SEED = 1_000_000  # the policy set's drives are numbered from here: never
 Progress = Callable[[str, int, int], None]
 
 
-def frames_folder(settings: StudySettings, root: Path = DATA) -> Path:
-    """Where the frame store of these settings lies, or will lie."""
-    return root / "frames" / frames_key(settings)
+def frames_folder(settings: StudySettings, root: Path = DATA, imported: Imported | None = None) -> Path:
+    """Where the frame store of these settings lies, or will lie: of our town's drives, or of the imported ones."""
+    return root / "frames" / frames_key(settings, imported.key if imported else None)
 
 
-def prepare(settings: StudySettings, root: Path, processes: int, progress: Progress) -> Path:
+def prepare(
+    settings: StudySettings, root: Path, processes: int, progress: Progress, imported: Imported | None = None
+) -> Path:
     """The frame store's folder, after recording and rendering whatever is missing.
 
     `progress(stage, done, total)` with stage "record" (drives) or "render" (frames).
-    Raises BadInputError when the settings cannot be met, the disk is too small or the store there is damaged.
+    Raises BadInputError when the settings cannot be met, the disk is too small, an imported drive has changed or the
+    store there is damaged.
     """
-    folder = frames_folder(settings, root)
+    folder = frames_folder(settings, root, imported)
     # Imported here: planning needs no arrays, and frames that exist can be studied on a machine without the simulator.
     from study.frames import build_frames, open_frames  # noqa: PLC0415
 
     if (folder / "manifest.json").is_file():
         open_frames(folder, check=True)  # a store that was damaged since is told now, not by every cell
         return folder
-    _check_room(settings, root)
+    _check_room(settings, root, imported)
+    if imported:
+        encoder_drives, policy_drives = imported.assign(settings.frames)
+        imported.check()
+    else:
+        drives = _record(settings, root, processes, progress)
+        split = settings.recording.encoder_episodes
+        encoder_drives, policy_drives = drives[:split], drives[split:]
+    build_frames(
+        settings.frames,
+        settings.birdview,
+        encoder_drives,
+        policy_drives,
+        folder,
+        processes,
+        lambda stage, done, whole: progress(stage, done, whole) if stage == "render" else None,
+        key=folder.name,
+    )
+    return folder
+
+
+def _record(settings: StudySettings, root: Path, processes: int, progress: Progress) -> list[Path]:
     from study.sim.record import record_all  # noqa: PLC0415
 
     recording = settings.recording
@@ -52,7 +80,7 @@ def prepare(settings: StudySettings, root: Path, processes: int, progress: Progr
         *range(first, first + recording.encoder_episodes),
         *range(second, second + recording.policy_episodes),
     ]
-    drives = record_all(
+    return record_all(
         settings.town,
         recording,
         seeds,
@@ -60,32 +88,26 @@ def prepare(settings: StudySettings, root: Path, processes: int, progress: Progr
         processes,
         lambda done, whole: progress("record", done, whole),
     )
-    split = recording.encoder_episodes
-    build_frames(
-        settings.frames,
-        settings.birdview,
-        drives[:split],
-        drives[split:],
-        folder,
-        processes,
-        lambda stage, done, whole: progress(stage, done, whole) if stage == "render" else None,
-        key=frames_key(settings),
-    )
-    return folder
 
 
-def _check_room(settings: StudySettings, root: Path) -> None:
+def _check_room(settings: StudySettings, root: Path, imported: Imported | None) -> None:
     try:
         root.mkdir(parents=True, exist_ok=True)
         free = shutil.disk_usage(root).free
     except OSError as error:
         raise BadInputError(f"cannot write to {root}: {error.strerror}; name another working folder") from error
-    need = data_cost(settings).bytes
+    folder = frames_folder(settings, root, imported)
+    there = _held(root / "episodes" / recording_key(settings)) + _held(folder.with_name(f".{folder.name}.building"))
+    need = data_cost(settings, recorded=imported is None).bytes - there  # what a killed build has taken is not free
     if need > free:
         raise BadInputError(
             f"{root} has {size(free)} free and the data needs about {size(need)}: "
             "free some room, or lower --frames.encoder and --recording.encoder_episodes"
         )
+
+
+def _held(folder: Path) -> int:
+    return sum(path.stat().st_blocks * 512 for path in folder.rglob("*") if path.is_file())
 
 
 # --- the command ----------------------------------------------------------------------------------------------------
@@ -95,14 +117,23 @@ def parser() -> Parser:
     """The command line."""
     made = Parser(
         prog="study.data",
-        usage="python -m study.data {build,card,preview} [--profile P] [--group.setting VALUE ...]",
+        usage="python -m study.data {build,card,preview} [--profile P] [--group.setting VALUE ...]\n"
+        "       python -m study.data import DIR [--out FOLDER]\n"
+        "       python -m study.data scenes [--out FOLDER] [--episodes N]",
         description="Make the data of a study, describe it, and show it.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog="build    record the drives and render the frames, whatever of them is missing\n"
         "card     what is in the data: PNG and text beside the frame store\n"
-        "preview  pictures of frames, and an animated drive, beside the frame store",
+        "preview  pictures of frames, and an animated drive, beside the frame store\n"
+        "import   check and adapt the Episodes in DIR, so that 'study.sweep NAME --data FOLDER' can use them\n"
+        "scenes   record highway-env's intersection, roundabout and merge as Episodes, to be imported",
     )
-    made.add_argument("action", choices=("build", "card", "preview"), help="what to do (below)")
+    made.add_argument("action", choices=("build", "card", "preview", "import", "scenes"), help="what to do (below)")
+    made.add_argument("folder", nargs="?", metavar="DIR", type=Path, help="import: where the Episodes are")
+    made.add_argument(
+        "--out", type=Path, metavar="FOLDER", help="import: default data/imported/<DIR's name>; scenes: data/scenes"
+    )
+    made.add_argument("--episodes", type=int, default=30, metavar="N", help="scenes: drives in all (default: 30)")
     made.add_argument(
         "--profile", default="laptop", help=f"{', '.join(named_files(SWEEPS / 'profiles'))} (default: laptop)"
     )
@@ -114,6 +145,20 @@ def parser() -> Parser:
 def main(args: Sequence[str]) -> int:
     """Run the command and return its exit code."""
     options = parser().parse(args)
+    if (options.folder is not None) != (options.action == "import"):
+        raise BadInputError(f"'{options.action}' got DIR {options.folder}; 'import', and only that, needs one")
+    if options.action == "import":
+        imported = import_drives(options.folder, options.out or DATA / "imported" / options.folder.resolve().name)
+        print(describe(imported))
+        print(imported.folder)
+        return 0
+    if options.action == "scenes":
+        from study.sim.scenes import record_scenes  # noqa: PLC0415
+
+        folder = options.out or DATA / "scenes"
+        record_scenes(folder, options.episodes, progress=_count)
+        print(folder)
+        return 0
     settings = load_profile(options.profile, study_overrides(options))
     if options.processes < 1:
         raise BadInputError(f"--processes is {options.processes}; it must be 1 or more")
@@ -142,6 +187,10 @@ def _show(action: str, settings: StudySettings, folder: Path) -> None:
 
         files = write_preview(store, drives, folder)
     print(*files, sep="\n")
+
+
+def _count(done: int, whole: int) -> None:
+    print(f"{done} of {whole} drives", file=sys.stderr)
 
 
 if __name__ == "__main__":

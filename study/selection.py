@@ -111,8 +111,9 @@ def _sample(
     """`wanted` rows of the pool without replacement, sorted; raked to the target margins unless `balance` is none."""
     if wanted > len(pool):
         raise BadInputError(
-            f"the {name} set needs {wanted}{split} frames and its drives give {len(pool)}: raise "
-            f"--recording.{name}_episodes or --recording.duration, or lower --frames.{name} or --frames.spacing"
+            f"the {name} set needs {wanted}{split} frames and its drives give {len(pool)}: lower "
+            f"--frames.{name} or --frames.spacing, or raise --recording.{name}_episodes or --recording.duration "
+            "(import more drives, if they are yours)"
         )
     if balance == "none":
         return np.sort(rng.permutation(pool)[:wanted])

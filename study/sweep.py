@@ -2,6 +2,7 @@
 
 python -m study.sweep heads
 python -m study.sweep datasize --profile smoke --dry-run
+python -m study.sweep heads --data data/imported/scenes
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ from study.config import (
 )
 from study.cost import Cost, cell_cost, clock, data_cost, size, total
 from study.data import DATA, frames_folder, prepare
+from study.imported import Imported, open_import
 
 EXIT_FAILED, EXIT_INTERRUPTED = 1, 130
 
@@ -50,6 +52,17 @@ class Plan:
     profile: str
     settings: StudySettings
     cells: dict[str, Cell]
+    imported: Imported | None = None
+
+    @property
+    def frames(self) -> Path:
+        """Where the frame store lies, or will lie."""
+        return frames_folder(self.settings, DATA, self.imported)
+
+    @property
+    def data_cost(self) -> Cost:
+        """Of the frame store, from nothing."""
+        return data_cost(self.settings, recorded=self.imported is None)
 
     @property
     def key(self) -> str:
@@ -57,12 +70,18 @@ class Plan:
         return content_key("plan", {"sweep": self.grid.name, "profile": self.profile}, tuple(self.cells), 1)
 
 
-def make_plan(name: str, profile: str, study: dict[str, Any], grid: dict[str, Any]) -> Plan:
-    """The plan of a sweep file, a profile and what the command line overrides. Raises BadInputError."""
+def make_plan(name: str, profile: str, study: dict[str, Any], grid: dict[str, Any], data: Path | None = None) -> Plan:
+    """The plan of a sweep file, a profile, what the command line overrides, and imported drives if there are any.
+
+    Raises BadInputError.
+    """
     settings, loaded = load_profile(profile, study), load_grid(name, grid)
-    frames = frames_key(settings)
+    imported = open_import(data) if data else None
+    if imported:
+        imported.assign(settings.frames)  # too few drives are told now
+    frames = frames_key(settings, imported.key if imported else None)
     cells = {cell_key(settings, cell, loaded.policy_seeds, frames): cell for cell in loaded.cells()}
-    return Plan(loaded, profile, settings, cells)
+    return Plan(loaded, profile, settings, cells, imported)
 
 
 # --- the command ----------------------------------------------------------------------------------------------------
@@ -93,6 +112,9 @@ def parser() -> Parser:
     made.add_argument("--workers", type=int, default=1, metavar="N", help="cells trained at a time (default: 1)")
     made.add_argument("--device", default="auto", help="cpu, cuda, cuda:1, ... (default: cuda where there is one)")
     made.add_argument("--tracking", default=DEFAULT_TRACKING, metavar="URI", help="MLflow store (default: %(default)s)")
+    made.add_argument(
+        "--data", type=Path, metavar="FOLDER", help="imported drives (study.data import); default: our town's"
+    )
     made.add_argument("--no-report", action="store_true", help="stop when the cells are finished")
     add_options(made, Grid, GRID_OPTIONS)
     add_options(made, StudySettings)
@@ -102,7 +124,8 @@ def parser() -> Parser:
 def main(args: Sequence[str]) -> int:
     """Run the command and return its exit code."""
     options = parser().parse(args)
-    plan = make_plan(options.sweep, options.profile, study_overrides(options), grid_overrides(options))
+    overrides = study_overrides(options), grid_overrides(options)
+    plan = make_plan(options.sweep, options.profile, *overrides, options.data)
     if options.json and not options.dry_run:
         raise BadInputError("--json goes with --dry-run; add --dry-run")
     if options.workers < 1:
@@ -131,8 +154,8 @@ def dry_run(plan: Plan, tracking: str, *, as_json: bool) -> int:
     costs = [
         cell_cost(plan.settings, cell, plan.grid.policy_seeds) for key, cell in plan.cells.items() if key not in done
     ]
-    ready = (frames_folder(plan.settings) / "manifest.json").is_file()
-    data = Cost(0, 0) if ready or not costs else data_cost(plan.settings)
+    ready = (plan.frames / "manifest.json").is_file()
+    data = Cost(0, 0) if ready or not costs else plan.data_cost
     whole = total([data, *costs])
     frames = plan.settings.frames
     facts = {
@@ -164,7 +187,7 @@ def dry_run(plan: Plan, tracking: str, *, as_json: bool) -> int:
         print(f"  {cell.label:<22} {key}  {plan.grid.policy_seeds} policies  {state}")
     counts = parameter_counts()
     heads = ", ".join(f"{head} head {counts[head]:,}" for head in HEADS)
-    where = "there already" if ready else f"about {clock(data.seconds)} to record and render"
+    where = "there already" if ready else f"about {clock(data.seconds)} to make"
     print(f"\nparameters  encoder {counts['encoder']:,}, {heads}")
     print(f"frames      {frames.encoder:,} for encoders, {frames.policy:,} for policies; {where}")
     print(f"disk        about {size(whole.bytes)}")
@@ -218,16 +241,16 @@ def execute(plan: Plan, options: argparse.Namespace) -> int:
     tracker = Tracker(options.tracking)
     waiting = [key for key in plan.cells if key not in tracker.finished(list(plan.cells))]
     costs = {key: cell_cost(plan.settings, plan.cells[key], plan.grid.policy_seeds).seconds for key in waiting}
-    ready = (frames_folder(plan.settings) / "manifest.json").is_file()
+    ready = (plan.frames / "manifest.json").is_file()
     with Display(
         f"{plan.grid.name} ({plan.profile})",
         costs,
         {key: cell.label for key, cell in plan.cells.items()},
-        0.0 if ready else data_cost(plan.settings).seconds,
+        0.0 if ready else plan.data_cost.seconds,
     ) as display:
-        frames = frames_folder(plan.settings)
+        frames = plan.frames
         if waiting:
-            frames = prepare(plan.settings, DATA, os.cpu_count() or 1, display.data)
+            frames = prepare(plan.settings, DATA, os.cpu_count() or 1, display.data, plan.imported)
         manifest = frames / "manifest.json"
         data = json.loads(manifest.read_text(encoding="utf-8")) if manifest.is_file() else {}
         sweep_run = tracker.open_sweep(plan.grid, plan.profile, plan.settings, plan.cells, data, provenance())
@@ -244,7 +267,8 @@ def execute(plan: Plan, options: argparse.Namespace) -> int:
                 from study.frames import open_frames  # noqa: PLC0415
 
                 store = open_frames(frames)
-                drives = source_drives(store, DATA / "episodes" / recording_key(plan.settings))
+                at = plan.imported.folder if plan.imported else DATA / "episodes" / recording_key(plan.settings)
+                drives = source_drives(store, at)
                 tracker.log_files(sweep_run, card_files(store, drives, frames), "data")
             with Workers(jobs, options.workers, tracker, sweep_run, queue, display) as workers:
                 failed = workers.run()

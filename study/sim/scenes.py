@@ -1,0 +1,197 @@
+"""Scenes: highway-env's own intersection, roundabout and merge as Episodes; the second writer of the format.
+
+All vehicles are highway-env's IDM drivers, the environment's ego too, and are stepped by the environment at its own
+15 Hz. They come and go. There are no lights, and no commands in the study's sense: an import derives them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from highway_env.envs.common.abstract import AbstractEnv
+from highway_env.envs.intersection_env import ContinuousIntersectionEnv
+from highway_env.envs.merge_env import MergeEnv
+from highway_env.envs.roundabout_env import RoundaboutEnv
+from highway_env.road.lane import AbstractLane, LineType, StraightLane
+from highway_env.road.road import LaneIndex, RoadNetwork
+from highway_env.vehicle.behavior import IDMVehicle
+from highway_env.vehicle.controller import ControlledVehicle
+
+from study.config import BadInputError
+from study.episode import Agent, Episode, Lane, empty_states, write_episode
+from study.sim.town import LENGTH, WIDTH, Floats
+
+SIMULATION_HZ = 15  # highway-env's own
+SHORTEST = 6.0  # a drive that ends sooner, by a crash or because all have left, is driven anew [s]
+ATTEMPTS = 50
+BORDERS = {
+    LineType.NONE: "none",
+    LineType.STRIPED: "dashed",
+    LineType.CONTINUOUS: "curb",  # unbroken lines bound the drivable area in all three
+    LineType.CONTINUOUS_LINE: "curb",
+}
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One of highway-env's environments, how long it is watched [s], and what of its configuration differs."""
+
+    environment: str
+    make: type[AbstractEnv]
+    seconds: float
+    config: dict[str, Any]
+
+
+SCENES = {
+    "intersection": Scene(
+        "intersection-v1",
+        ContinuousIntersectionEnv,
+        20.0,
+        {"spawn_probability": 0.6 / SIMULATION_HZ},  # it is asked every step, by default once a second
+    ),
+    "roundabout": Scene("roundabout-v0", RoundaboutEnv, 14.0, {}),
+    "merge": Scene("merge-v0", MergeEnv, 14.0, {}),
+}
+
+
+def record_scenes(
+    folder: Path, episodes: int, seed: int = 0, progress: Callable[[int, int], None] | None = None
+) -> list[Path]:
+    """Record `episodes` drives of the scenes in turn as `folder/<scene>-<number>`; returns the folders.
+
+    `progress` gets (drives done, drives in all). Raises BadInputError for fewer than one drive.
+    """
+    if episodes < 1:
+        raise BadInputError(f"episodes: got {episodes}; at least 1 is needed")
+    paths = []
+    for number in range(episodes):
+        name = list(SCENES)[number % len(SCENES)]
+        path = folder / f"{name}-{number // len(SCENES):04d}"
+        write_episode(record_scene(name, seed + number // len(SCENES)), path)
+        paths.append(path)
+        if progress is not None:
+            progress(number + 1, episodes)
+    return paths
+
+
+def record_scene(name: str, seed: int) -> Episode:
+    """One drive of a scene at 15 Hz, until its time is over, a crash, or an empty road; same arguments, same bits.
+
+    Raises BadInputError when no drive of `SHORTEST` comes about.
+    """
+    scene = SCENES[name]
+    for attempt in range(ATTEMPTS):
+        with _own_defaults():
+            episode = _drive(name, scene, seed, attempt)
+        if episode.steps >= SHORTEST * SIMULATION_HZ:
+            return episode
+    raise BadInputError(f"{name}: no drive of {SHORTEST:g} s without a crash in {ATTEMPTS} attempts with seed {seed}")
+
+
+@contextmanager
+def _own_defaults() -> Iterator[None]:
+    """The intersection changes the IDM drivers' class: put it back, or what follows would depend on the order."""
+    names = ("DISTANCE_WANTED", "COMFORT_ACC_MAX", "COMFORT_ACC_MIN")
+    kept = {name: getattr(IDMVehicle, name) for name in names}
+    try:
+        yield
+    finally:
+        for key, value in kept.items():
+            setattr(IDMVehicle, key, value)
+
+
+def _drive(name: str, scene: Scene, seed: int, attempt: int) -> Episode:
+    steps = round(scene.seconds * SIMULATION_HZ)
+    config = scene.config | {
+        "simulation_frequency": SIMULATION_HZ,
+        "policy_frequency": SIMULATION_HZ,
+        "other_vehicles_type": "highway_env.vehicle.behavior.IDMVehicle",
+    }
+    env: Any = scene.make(config)
+    env.reset(seed=seed * ATTEMPTS + attempt)
+    network = env.road.network
+    _let_it_drive(env)
+    numbers: dict[int, int] = {}  # id of the vehicle object -> agent
+    kept: list[ControlledVehicle] = []  # so that no id is used again
+    routes: list[np.ndarray[Any, Any]] = []
+    rows: list[list[tuple[int, float, float, float, float]]] = []
+    for _ in range(steps):
+        env.road.vehicles = [vehicle for vehicle in env.road.vehicles if not _left(network, vehicle)]
+        if not env.road.vehicles or any(vehicle.crashed for vehicle in env.road.vehicles):
+            break
+        row = []
+        for vehicle in env.road.vehicles:
+            if id(vehicle) not in numbers:
+                numbers[id(vehicle)] = len(kept)
+                kept.append(vehicle)
+                routes.append(_route(network, vehicle))
+            x, y = vehicle.position
+            row.append((numbers[id(vehicle)], x, -y, -vehicle.heading, vehicle.speed))
+        rows.append(row)
+        env.step(None)
+    env.close()
+    arrays = empty_states(len(rows), len(kept))
+    for step, row in enumerate(rows):
+        for agent, x, y, heading, speed in row:
+            arrays["present"][step, agent] = True
+            arrays["x"][step, agent], arrays["y"][step, agent] = x, y
+            arrays["heading"][step, agent] = math.remainder(heading, 2 * math.pi)
+            arrays["speed"][step, agent] = max(speed, 0.0)
+    return Episode(
+        id=f"{name}-{seed:04d}",
+        source={"writer": "study.sim.scenes", "environment": scene.environment, "seed": seed, "attempt": attempt},
+        rate_hz=float(SIMULATION_HZ),
+        labels="none",
+        agents=tuple(Agent(number, LENGTH, WIDTH) for number in range(len(kept))),
+        lanes=tuple(_lane(number, index, network) for number, index in enumerate(network.lanes_dict())),
+        lights=(),
+        light_state=np.zeros((len(rows), 0), np.uint8),
+        routes=tuple(routes),
+        **arrays,
+    )
+
+
+def _let_it_drive(env: Any) -> None:
+    """Put an IDM driver in the place of the environment's ego, who would need somebody to drive it."""
+    ego = env.vehicle
+    driver = IDMVehicle(env.road, ego.position, ego.heading, ego.speed, route=getattr(ego, "route", None))
+    if driver.route is None and env.config.get("destination"):
+        driver.plan_route_to(env.config["destination"])
+    env.road.vehicles[env.road.vehicles.index(ego)] = driver
+    env.vehicle = driver
+
+
+def _left(network: RoadNetwork, vehicle: ControlledVehicle) -> bool:
+    """Whether a vehicle is beyond the end of a lane that leads nowhere."""
+    return vehicle.lane_index[1] not in network.graph and bool(vehicle.lane.after_end(vehicle.position, None))
+
+
+def _points(lane: AbstractLane) -> Floats:
+    """Centre line [P, 2] m, y to the north: the ends of a straight, else points within 1 m of each other."""
+    count = 1 if type(lane) is StraightLane else math.ceil(lane.length)
+    return np.array([lane.position(s, 0) for s in np.linspace(0, lane.length, count + 1)]) * [1, -1]
+
+
+def _lane(number: int, index: LaneIndex, network: RoadNetwork) -> Lane:
+    lane = network.get_lane(index)
+    left, right = (BORDERS[border] for border in lane.line_types)
+    junction = index[0].startswith("ir")  # only the intersection has such a node
+    return Lane(number, _points(lane), float(lane.width_at(0)), left, right, junction, lane.speed_limit)
+
+
+def _route(network: RoadNetwork, vehicle: ControlledVehicle) -> np.ndarray[Any, Any]:
+    """The planned way over the lanes nearest to each other, [P, 2] float32, empty where nothing is planned."""
+    points = np.empty((0, 2))
+    for start, end, number in vehicle.route or ():
+        lanes = network.graph[start][end]
+        options = [_points(lane) for lane in (lanes if number is None else [lanes[number]])]
+        here = points[-1] if len(points) else vehicle.position * [1, -1]
+        nearest = min(options, key=lambda option: float(np.hypot(*(option - here).T).min()))
+        points = np.concatenate([points, nearest])
+    return points.astype(np.float32)
