@@ -145,8 +145,10 @@ def parser() -> Parser:
 def main(args: Sequence[str]) -> int:
     """Run the command and return its exit code."""
     options = parser().parse(args)
-    if (options.folder is not None) != (options.action == "import"):
-        raise BadInputError(f"'{options.action}' got DIR {options.folder}; 'import', and only that, needs one")
+    if options.action == "import" and options.folder is None:
+        raise BadInputError("import: no DIR given; name the folder with the Episodes")
+    if options.action != "import" and options.folder is not None:
+        raise BadInputError(f"'{options.folder}' is one word too many; only import takes a DIR")
     if options.action == "import":
         imported = import_drives(options.folder, options.out or DATA / "imported" / options.folder.resolve().name)
         print(describe(imported))

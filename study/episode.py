@@ -404,6 +404,11 @@ def _read_lights(path: Path, steps: int, lights: tuple[Light, ...]) -> NDArray[n
     if outside.any():
         row = int(outside.argmax())
         raise BadInputError(f"{path}, row {row}, field 'step': {step[row]} is outside 0 to {steps - 1}")
+    again = np.ones(len(step), bool)
+    again[np.unique(step.astype(np.int64) * max(len(lights), 1) + at, return_index=True)[1]] = False
+    if again.any():
+        row = int(again.argmax())
+        raise BadInputError(f"{path}, row {row}: light {columns['light'][row]} has two states in step {step[row]}")
     state[step, at] = columns["state"]
     if (state > RED).any():
         step_, light = np.argwhere(state > RED)[0]

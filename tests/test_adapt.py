@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 
 import numpy as np
 import pandas as pd
@@ -11,10 +12,13 @@ from drives import crossing_drive, write_drives
 from study.adapt import STEERING_UNIT, adapt, derived_commands
 from study.birdview import valid_moments
 from study.config import BadInputError, FramesSettings, load_profile
+from study.data import prepare
 from study.episode import file_digest, read_episode, write_episode
+from study.frames import open_frames
 from study.imported import import_drives, open_import
 from study.sim import autopilot
 from study.sim.record import record_episode
+from study.sweep import make_plan
 
 
 @pytest.fixture(scope="module")
@@ -235,3 +239,35 @@ def test_too_few_drives_are_told_with_what_is_needed(folder, tmp_path):
     imported = import_drives(folder, tmp_path / "out")
     with pytest.raises(BadInputError, match="needs 4 or more"):
         dataclasses.replace(imported, drives=imported.drives[:3]).assign(FramesSettings())
+
+
+def test_a_sweeps_cells_are_known_by_the_drives_they_stand_on(folder, tmp_path):
+    import_drives(folder, tmp_path / "one")
+    write_drives(folder, 1, first_seed=50, cars=4, steps=60)
+    import_drives(folder, tmp_path / "two")
+    plans = [make_plan("heads", "smoke", {}, {}, data) for data in (None, tmp_path / "one", tmp_path / "two")]
+    keys = [set(plan.cells) for plan in plans]
+    assert not keys[0] & keys[1]
+    assert not keys[1] & keys[2]
+    assert len({plan.frames for plan in plans}) == 3
+
+
+def test_imported_drives_become_the_frames_of_a_sweep(folder, tmp_path):
+    imported = import_drives(folder, tmp_path / "out")
+    settings = load_profile("smoke", {"frames": {"encoder": 10, "policy": 10}})
+    store = open_frames(prepare(settings, tmp_path, 1, lambda *_: None, imported))
+    assert (len(store.encoder), len(store.policy)) == (10, 10)
+    assert not (tmp_path / "episodes").exists()
+
+
+def test_drives_that_give_too_few_frames_are_told_with_the_setting(folder, tmp_path):
+    imported = import_drives(folder, tmp_path / "out")
+    with pytest.raises(BadInputError, match=r"needs \d+ .*frames.*lower --frames\.encoder"):
+        prepare(load_profile("smoke"), tmp_path, 1, lambda *_: None, imported)
+
+
+def test_a_drive_that_has_changed_since_is_told(folder, tmp_path):
+    imported = import_drives(folder, tmp_path / "out")
+    shutil.copy(folder / "drive-000" / "episode.json", tmp_path / "out" / "drive-001" / "episode.json")
+    with pytest.raises(BadInputError, match="drive-001 is not what was imported"):
+        imported.check()

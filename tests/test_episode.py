@@ -179,3 +179,9 @@ def test_a_light_without_a_state_is_refused(folder):
 def test_a_folder_that_is_none_is_refused(tmp_path):
     with pytest.raises(BadInputError, match=r"is .* an Episode"):
         read_episode(tmp_path)
+
+
+def test_a_light_with_two_states_in_a_step_is_refused(folder):
+    edit(folder, "lights.parquet", lambda table: pd.concat([table, table.iloc[:1]]))
+    with pytest.raises(BadInputError, match=r"lights\.parquet, row \d+: light \d+ has two states in step 0"):
+        read_episode(folder)
