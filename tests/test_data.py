@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from study.config import BadInputError, load_profile
+from study.cost import data_cost
 from study.data import frames_folder, prepare
 from study.frames import open_frames
 
@@ -62,6 +63,13 @@ def test_a_full_disk_is_told_before_anything_is_made(settings, tmp_path, monkeyp
     with pytest.raises(BadInputError, match="free"):
         prepare(settings, tmp_path, 1, lambda *_: None)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_room_that_a_killed_build_has_taken_is_not_asked_for_again(settings, root, tmp_path, monkeypatch):
+    shutil.copytree(root / "episodes", tmp_path / "episodes")
+    free = data_cost(settings).bytes - 10_000
+    monkeypatch.setattr("study.data.shutil.disk_usage", lambda _: SimpleNamespace(free=free))
+    assert (prepare(settings, tmp_path, 1, lambda *_: None) / "manifest.json").is_file()
 
 
 def test_a_folder_that_cannot_be_made_is_told(settings, tmp_path):
