@@ -46,6 +46,12 @@ def runs(folder):
         return Counter(status for (status,) in database.execute(query))
 
 
+def take(folder, to):
+    """A working folder with the drives and frames of another, but nothing trained."""
+    for name in ("sweeps", "data/episodes", "data/frames"):
+        shutil.copytree(folder / name, to / name)
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A working folder in which `heads` has run with two head sets."""
@@ -61,6 +67,11 @@ def test_a_sweep_ends_with_its_report(folder):
     assert (folder / "reports/heads/report.json").is_file()
 
 
+def test_a_sweep_run_holds_the_data_card(folder):
+    cards = {path.name for path in folder.glob("mlruns/artifacts/*/artifacts/data/*")}
+    assert cards == {"card.json", "card.txt", "card.png"}
+
+
 def test_the_same_command_again_trains_nothing(folder):
     before = runs(folder)
     done = sweep(folder, "heads", *SMALL, *TWO)
@@ -73,8 +84,9 @@ def test_datasize_reuses_the_cells_of_heads(folder):
     assert status(folder, "datasize", *SMALL, "--fractions", "[1.0,0.5]") == {"finished": 2, "waiting": 2}
 
 
-def test_a_failed_cell_leaves_the_others_and_is_told(folder):
-    done = sweep(folder, "heads", *SMALL, "--heads", "[rec,rec+pred]", "--encoder.lr", "1e30", "--no-report")
+def test_a_failed_cell_leaves_the_others_and_is_told(folder, tmp_path):
+    take(folder, tmp_path)
+    done = sweep(tmp_path, "heads", *SMALL, "--heads", "[rec,rec+pred]", "--encoder.lr", "1e30", "--no-report")
     assert done.returncode == 1
     assert "failed: rec 100% e0" in done.stderr
     assert "failed: rec+pred 100% e0" in done.stderr
@@ -83,8 +95,7 @@ def test_a_failed_cell_leaves_the_others_and_is_told(folder):
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
 def test_a_stopped_sweep_goes_on_and_ends_like_one_that_was_not(folder, tmp_path, how):
-    for name in ("sweeps", "data"):
-        shutil.copytree(folder / name, tmp_path / name)
+    take(folder, tmp_path)
     process = subprocess.Popen(
         command("heads", *SMALL, *TWO), cwd=tmp_path, stderr=subprocess.PIPE, text=True, env=environment()
     )
