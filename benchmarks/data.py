@@ -177,7 +177,8 @@ def paper_scale(folder: Path) -> dict[str, Any]:
     (folder / "sweeps").symlink_to(ROOT / "sweeps")
     command = [sys.executable, "-m", "study.data", "build", "--profile", PROFILE]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    begin = time.perf_counter()
+    load = os.getloadavg()[0]
+    begin, busy = time.perf_counter(), os.times()
     with subprocess.Popen(command, cwd=folder, env=environment) as build:
         memory = Memory(build.pid)
         recorded = 0.0
@@ -186,7 +187,7 @@ def paper_scale(folder: Path) -> dict[str, Any]:
             if not recorded and (folder / "data" / "frames").exists():
                 recorded = time.perf_counter() - begin
             time.sleep(SAMPLE_EVERY)
-    seconds = time.perf_counter() - begin
+    seconds, after = time.perf_counter() - begin, os.times()
     if build.returncode:
         raise SystemExit(f"the build failed with exit code {build.returncode}")
     manifest = json.loads((folder / "data" / "frames" / frames_key(settings) / "manifest.json").read_text())
@@ -196,6 +197,8 @@ def paper_scale(folder: Path) -> dict[str, Any]:
         "peak_bytes": memory.highest,
         "peak_bytes_together": memory.together,
         "seconds_recording": round(recorded, 1),
+        "processor_seconds": round(after[2] + after[3] - busy[2] - busy[3], 1),
+        "load_before": load,
         "disk_bytes": sum(path.stat().st_size for path in (folder / "data").rglob("*") if path.is_file()),
         "digest": manifest["digest"],
     }
