@@ -48,6 +48,12 @@ class Imported:
         """Stands for these drives in the keys of all that is made from them."""
         return content_key("imported", sorted((drive.name, drive.digest) for drive in self.drives), (), SCHEMA_VERSION)
 
+    @property
+    def writers(self) -> list[str]:
+        """What wrote the drives, by their own word."""
+        heads = (json.loads((self.folder / drive.name / "episode.json").read_text()) for drive in self.drives)
+        return sorted({str(head["source"].get("writer", "unknown")) for head in heads})
+
     def check(self) -> None:
         """Raise BadInputError when a drive is not the one that was imported."""
         from study.episode import episode_digest  # noqa: PLC0415 - planning needs no arrays

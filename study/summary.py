@@ -95,13 +95,15 @@ def _points(record: SweepRecord) -> list[Point]:
 
 def _sweep(record: SweepRecord, design: str) -> Numbers:
     grid = record.grid
+    writers = record.data.get("writers", [])
     unfinished = [
         cell for key, cell in record.planned.items() if key not in record.results and key not in record.failed
     ]
     return {
         "name": grid.name,
         "title": grid.title,
-        "simulator": SIMULATOR,
+        "simulator": f"imported drives, written by {', '.join(writers)}" if writers else SIMULATOR,
+        "imported": bool(writers),
         "profile": record.profile,
         "design": design,
         "encoder_seeds": grid.encoder_seeds,

@@ -239,7 +239,8 @@ def execute(plan: Plan, options: argparse.Namespace) -> int:
     from study.worker import Workers  # noqa: PLC0415
 
     tracker = Tracker(options.tracking)
-    waiting = [key for key in plan.cells if key not in tracker.finished(list(plan.cells))]
+    done = tracker.finished(list(plan.cells))
+    waiting = [key for key in plan.cells if key not in done]
     costs = {key: cell_cost(plan.settings, plan.cells[key], plan.grid.policy_seeds).seconds for key in waiting}
     ready = (plan.frames / "manifest.json").is_file()
     with Display(
@@ -253,6 +254,8 @@ def execute(plan: Plan, options: argparse.Namespace) -> int:
             frames = prepare(plan.settings, DATA, os.cpu_count() or 1, display.data, plan.imported)
         manifest = frames / "manifest.json"
         data = json.loads(manifest.read_text(encoding="utf-8")) if manifest.is_file() else {}
+        if plan.imported:
+            data["writers"] = plan.imported.writers  # a report must not call these drives our town's
         sweep_run = tracker.open_sweep(plan.grid, plan.profile, plan.settings, plan.cells, data, provenance())
         status: Literal["FINISHED", "FAILED", "KILLED"] = "KILLED"
         queue = Queue(f"{plan.grid.name} {plan.profile} {plan.key}", plan.cells)

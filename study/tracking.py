@@ -80,6 +80,9 @@ VIEW = {
     "tags.`sweep`": 110,
 }
 
+# SQLite bears one writer: live curves of one cell wait while another cell is committed.
+_ONE_WRITER = threading.RLock()
+
 Status = Literal["FINISHED", "FAILED", "KILLED"]
 Point = tuple[str, int, float]  # metric, epoch, value
 Numbers = NDArray[np.float64]
@@ -129,7 +132,8 @@ class CellRun:
         with self._lock:
             batch, self._pending = self._pending, []
         try:
-            self.client.log_batch(self.run_id, metrics=batch)
+            with _ONE_WRITER:
+                self.client.log_batch(self.run_id, metrics=batch)
         except BaseException:
             with self._lock:  # written in part or whole, it may be written again: the same points are the same rows
                 self._pending = batch + self._pending
@@ -412,10 +416,10 @@ class Tracker:
         """
         if result.key != cell_run.key:
             raise ValueError(f"result of cell {result.key} given for the run of {cell_run.key}")
-        with self._guard():
+        cell_run.stop()
+        with _ONE_WRITER, self._guard():
             other = self._finished([cell_run.key]).get(cell_run.key)
             if other is not None and other.info.run_id != cell_run.run_id:
-                cell_run.stop()
                 self._close(cell_run.run_id, "KILLED", {"superseded_by": other.info.run_id})
                 return str(other.info.run_id)
             with tempfile.TemporaryDirectory() as folder:

@@ -2,6 +2,7 @@ import json
 import re
 import subprocess
 import sys
+from dataclasses import replace
 
 import pandas as pd
 import pytest
@@ -94,6 +95,14 @@ def test_a_complete_report_has_no_banner_and_names_its_simulator_and_design(buil
     assert "Incomplete" not in text
     assert "highway-env" in text.split("Summary")[0]
     assert "nothing about other encoders" in text
+
+
+def test_a_report_on_imported_drives_names_their_writer_and_not_our_town(tmp_path):
+    record = simulate(HEADS_GRID, World(epochs=6))
+    pdf = build_report(replace(record, data=record.data | {"writers": ["lab logger 3"]}), tmp_path)
+    text = pdf_text(pdf)
+    assert "imported drives, written by lab logger 3" in text
+    assert "a town of our own" not in text
 
 
 def test_unfinished_and_failed_cells_are_named_on_the_first_page(tmp_path):
