@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import multiprocessing
+import os
+import signal
 import sys
+import threading
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
@@ -100,3 +104,19 @@ def run(main: Callable[[Sequence[str]], int]) -> NoReturn:
         sys.stderr.close()
         code = 0
     sys.exit(code)
+
+
+def obey_parent() -> None:
+    """In a child process: leave Ctrl-C to the parent, and end when the parent has been killed.
+
+    A child that works on would have nobody to take what it makes.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+
+    def watch() -> None:
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

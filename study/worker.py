@@ -11,13 +11,12 @@ import dataclasses
 import multiprocessing
 import os
 import shutil
-import signal
-import threading
 import traceback
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from typing import Any, Self
 
+from study.command import obey_parent
 from study.config import BadInputError
 from study.display import Display
 from study.grid import Queue, Ticket
@@ -34,8 +33,7 @@ SCORE = "acceleration_accuracy"
 
 def serve(job: CellJob, parent: Connection) -> None:
     """Run a cell in a child process and tell the parent of it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides what it means
-    _end_with_parent()
+    obey_parent()
     try:
         from study.cell import run_cell  # noqa: PLC0415 - the parent needs no torch
 
@@ -52,18 +50,6 @@ def serve(job: CellJob, parent: Connection) -> None:
         parent.send(("failed", False, traceback.format_exc()))
     else:
         parent.send(("done",))
-
-
-def _end_with_parent() -> None:
-    """A parent that is killed must not leave a child that trains on: nobody would commit what it makes."""
-    parent = multiprocessing.parent_process()
-
-    def watch() -> None:
-        if parent is not None:
-            parent.join()
-            os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
 
 
 # --- the parent's side ----------------------------------------------------------------------------------------------

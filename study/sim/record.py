@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import math
 import multiprocessing
-import os
 import shutil
-import signal
-import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -16,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from study.command import obey_parent
 from study.config import FORMAT_VERSIONS, BadInputError, RecordingSettings, TownSettings
 from study.episode import Agent, Episode, Lane, Light, empty_states, write_episode
 from study.sim.autopilot import DT, STEERING_UNIT
@@ -201,7 +199,7 @@ def record_all(
             report()
         return paths
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(processes, len(jobs)), mp_context=context, initializer=_obey_parent) as pool:
+    with ProcessPoolExecutor(min(processes, len(jobs)), mp_context=context, initializer=obey_parent) as pool:
         futures = [pool.submit(_record, *job) for job in jobs]
         try:
             for future in as_completed(futures):
@@ -228,16 +226,3 @@ def _sweep(folder: Path) -> None:
     for draft in folder.glob(".*"):
         if draft.is_dir() and time.time() - draft.stat().st_mtime > STALE:
             shutil.rmtree(draft, ignore_errors=True)
-
-
-def _obey_parent() -> None:
-    """In a worker: leave Ctrl-C to the parent, and end when the parent has been killed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
-
-    def watch() -> None:
-        if parent is not None:
-            parent.join()
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
