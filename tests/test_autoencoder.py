@@ -143,7 +143,11 @@ def test_every_head_gives_an_image_of_the_inputs_size() -> None:
 
 
 def test_networks_equal_plain_torch_layers_in_output_and_gradient() -> None:
-    """Biases that BatchNorm cancels are left out of the backward pass, which changes no other gradient."""
+    """Biases that BatchNorm cancels are left out of the backward pass, which changes no other gradient.
+
+    Weight gradients before a BatchNorm are differences of large sums: two kernels that add in another order agree only
+    relative to the whole gradient, not number by number.
+    """
     decoder = Decoder(1)
     plain = [
         nn.Conv2d(*_shape(layer), 4, 2)
@@ -168,7 +172,7 @@ def test_networks_equal_plain_torch_layers_in_output_and_gradient() -> None:
     for name, layer in zip(("0", "3"), (stock[0], stock[3]), strict=True):
         expected = layer.weight.grad
         got = decoder.convolutions.get_submodule(name)
-        assert torch.allclose(got.weight.grad, expected, rtol=1e-3, atol=1e-6 * float(expected.abs().max()) + 1e-7)
+        assert (got.weight.grad - expected).norm() < 1e-4 * expected.norm()
         assert layer.bias.grad.abs().max() < 1e-4 * expected.abs().max()
     assert torch.allclose(decoder.output.bias.grad, stock[-1].bias.grad, rtol=1e-4)
 
