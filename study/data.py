@@ -12,7 +12,6 @@ python -m study.data import scenes
 from __future__ import annotations
 
 import argparse
-import os
 import shutil
 import sys
 from collections.abc import Callable, Sequence
@@ -22,6 +21,7 @@ from study.command import Parser, add_options, run, study_overrides
 from study.config import SWEEPS, BadInputError, StudySettings, frames_key, load_profile, named_files, recording_key
 from study.cost import data_cost, size
 from study.imported import Imported, describe, import_drives
+from study.provenance import cores
 
 DATA = Path("data")
 POLICY_SEED = 1_000_000  # the policy set's drives are numbered from here: never those of the encoder set (Sec. V-A)
@@ -137,7 +137,7 @@ def parser() -> Parser:
     made.add_argument(
         "--profile", default="laptop", help=f"{', '.join(named_files(SWEEPS / 'profiles'))} (default: laptop)"
     )
-    made.add_argument("--processes", type=int, default=os.cpu_count() or 1, metavar="N", help="default: all cores")
+    made.add_argument("--processes", type=int, default=cores(), metavar="N", help="default: all cores")
     add_options(made, StudySettings)
     return made
 

@@ -233,7 +233,7 @@ def execute(plan: Plan, options: argparse.Namespace) -> int:
     # Imported here, so that --help and --dry-run need none of it.
     from study.display import Display  # noqa: PLC0415
     from study.grid import Queue  # noqa: PLC0415
-    from study.provenance import provenance  # noqa: PLC0415
+    from study.provenance import cores, provenance  # noqa: PLC0415
     from study.result import CellJob  # noqa: PLC0415
     from study.tracking import Tracker  # noqa: PLC0415
     from study.worker import Workers  # noqa: PLC0415
@@ -251,7 +251,7 @@ def execute(plan: Plan, options: argparse.Namespace) -> int:
     ) as display:
         frames = plan.frames
         if waiting:
-            frames = prepare(plan.settings, DATA, os.cpu_count() or 1, display.data, plan.imported)
+            frames = prepare(plan.settings, DATA, cores(), display.data, plan.imported)
         manifest = frames / "manifest.json"
         data = json.loads(manifest.read_text(encoding="utf-8")) if manifest.is_file() else {}
         if plan.imported:

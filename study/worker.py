@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import multiprocessing
-import os
 import shutil
 import traceback
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from study.command import obey_parent
 from study.config import BadInputError
 from study.display import Display
 from study.grid import Queue, Ticket
+from study.provenance import cores
 from study.result import CellJob, CellResult, TrainingDivergedError
 from study.tracking import CellRun, Tracker
 
@@ -75,7 +75,7 @@ class Workers:
     ) -> None:
         self._jobs, self._tracker, self._sweep_run = jobs, tracker, sweep_run
         self._queue, self._display = queue, display
-        self._threads = max(1, (os.cpu_count() or 1) // count)
+        self._threads = max(1, cores() // count)
         self._slots = list(range(count))
         self._running: list[Worker] = []
         self._tries: dict[str, int] = {}

@@ -2,12 +2,13 @@
 
 import getpass
 import json
+import os
 import platform
 import subprocess
 
 import pytest
 
-from study.provenance import DIFF_LIMIT, provenance
+from study.provenance import DIFF_LIMIT, cores, provenance
 
 
 def git(folder, *words):
@@ -69,3 +70,13 @@ def test_no_user_or_host_name_is_told(checkout):
     assert platform.node() not in text
     assert getpass.getuser() not in text
     assert str(checkout) not in text
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="processes have no core mask here")
+def test_a_process_counts_the_cores_that_it_was_given():
+    allowed = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(allowed)})
+    try:
+        assert cores() == provenance()["cores"] == 1
+    finally:
+        os.sched_setaffinity(0, allowed)
