@@ -162,7 +162,8 @@ def _twins(frames: Frames, test_share: float, number: int) -> dict[str, Any]:
     """Distance of test frames to their nearest training frame, when whole drives and when single frames are split.
 
     Whole drives are drawn until they have POOL frames, so that what lies close in time stays together; the same
-    frames are then split both ways, into parts of about the same size.
+    frames are then split both ways, into parts of about the same size. Frames of a single drive can only be split one
+    by one: there is no entry `episode` then.
     """
     rng = np.random.default_rng([_POOL, number])
     episode = frames.labels["episode"].to_numpy()
@@ -179,9 +180,12 @@ def _twins(frames: Frames, test_share: float, number: int) -> dict[str, Any]:
     held = rng.permutation(drawn)[: min(max(1, round(len(drawn) * test_share)), len(drawn) - 1)]
     by_drive = np.isin(drive, held)
     by_frame = np.zeros(len(rows), bool)
-    by_frame[np.random.default_rng([_FRAME, number]).permutation(len(rows))[: int(by_drive.sum())]] = True
+    tests = int(by_drive.sum()) or max(1, round(len(rows) * test_share))
+    by_frame[np.random.default_rng([_FRAME, number]).permutation(len(rows))[:tests]] = True
     found: dict[str, Any] = {"frames": len(rows), "drives": len(drawn)}
     for name, test in (("episode", by_drive), ("frame", by_frame)):
+        if not test.any():
+            continue
         asked = np.flatnonzero(test)
         asked = np.sort(rng.permutation(asked)[:QUERIES])
         distance, nearest = nearest_frames(pictures[asked], pictures[~test])
@@ -300,6 +304,9 @@ def _twin_lines(twins: dict[str, Any]) -> list[str]:
         f"  pixels, in grey levels of 255; {twins['frames']:,} frames of {twins['drives']} drives, split both ways",
     ]
     for name in ("episode", "frame"):
+        if name not in twins:
+            lines.append(f"    split: {name:<8} all frames are of one drive")
+            continue
         part = twins[name]
         quantiles = ", ".join(
             f"{100 * share:.0f} % {value:.2f}" for share, value in zip(QUANTILES, part["quantiles"], strict=True)

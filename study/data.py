@@ -20,7 +20,7 @@ from pathlib import Path
 from study.command import Parser, add_options, run, study_overrides
 from study.config import SWEEPS, BadInputError, StudySettings, frames_key, load_profile, named_files, recording_key
 from study.cost import data_cost, size
-from study.imported import Imported, describe, import_drives
+from study.imported import Imported, describe, import_drives, open_import
 from study.provenance import cores
 
 DATA = Path("data")
@@ -32,6 +32,11 @@ Progress = Callable[[str, int, int], None]
 def frames_folder(settings: StudySettings, root: Path = DATA, imported: Imported | None = None) -> Path:
     """Where the frame store of these settings lies, or will lie: of our town's drives, or of the imported ones."""
     return root / "frames" / frames_key(settings, imported.key if imported else None)
+
+
+def drives_folder(settings: StudySettings, root: Path = DATA, imported: Imported | None = None) -> Path:
+    """Where the drives behind that frame store lie, or will lie."""
+    return imported.folder if imported else root / "episodes" / recording_key(settings)
 
 
 def prepare(
@@ -84,7 +89,7 @@ def _record(settings: StudySettings, root: Path, processes: int, progress: Progr
         settings.town,
         recording,
         seeds,
-        root / "episodes" / recording_key(settings),
+        drives_folder(settings, root),
         processes,
         lambda done, whole: progress("record", done, whole),
     )
@@ -97,7 +102,7 @@ def _check_room(settings: StudySettings, root: Path, imported: Imported | None) 
     except OSError as error:
         raise BadInputError(f"cannot write to {root}: {error.strerror}; name another working folder") from error
     folder = frames_folder(settings, root, imported)
-    there = _held(root / "episodes" / recording_key(settings)) + _held(folder.with_name(f".{folder.name}.building"))
+    there = _held(drives_folder(settings, root)) + _held(folder.with_name(f".{folder.name}.building"))
     need = data_cost(settings, recorded=imported is None).bytes - there  # what a killed build has taken is not free
     if need > free:
         raise BadInputError(
@@ -117,7 +122,7 @@ def parser() -> Parser:
     """The command line."""
     made = Parser(
         prog="study.data",
-        usage="python -m study.data {build,card,preview} [--profile P] [--group.setting VALUE ...]\n"
+        usage="python -m study.data {build,card,preview} [--profile P] [--data FOLDER] [--group.setting VALUE ...]\n"
         "       python -m study.data import DIR [--out FOLDER]\n"
         "       python -m study.data scenes [--out FOLDER] [--episodes N]",
         description="Make the data of a study, describe it, and show it.",
@@ -137,6 +142,9 @@ def parser() -> Parser:
     made.add_argument(
         "--profile", default="laptop", help=f"{', '.join(named_files(SWEEPS / 'profiles'))} (default: laptop)"
     )
+    made.add_argument(
+        "--data", type=Path, metavar="FOLDER", help="imported drives (study.data import); default: our town's"
+    )
     made.add_argument("--processes", type=int, default=cores(), metavar="N", help="default: all cores")
     add_options(made, StudySettings)
     return made
@@ -150,9 +158,9 @@ def main(args: Sequence[str]) -> int:
     if options.action != "import" and options.folder is not None:
         raise BadInputError(f"'{options.folder}' is one word too many; only import takes a DIR")
     if options.action == "import":
-        imported = import_drives(options.folder, options.out or DATA / "imported" / options.folder.resolve().name)
-        print(describe(imported))
-        print(imported.folder)
+        made = import_drives(options.folder, options.out or DATA / "imported" / options.folder.resolve().name)
+        print(describe(made))
+        print(made.folder)
         return 0
     if options.action == "scenes":
         from study.sim.scenes import record_scenes  # noqa: PLC0415
@@ -164,23 +172,25 @@ def main(args: Sequence[str]) -> int:
     settings = load_profile(options.profile, study_overrides(options))
     if options.processes < 1:
         raise BadInputError(f"--processes is {options.processes}; it must be 1 or more")
+    imported = open_import(options.data) if options.data else None
     from study.display import Display  # noqa: PLC0415
 
-    with Display(f"data ({options.profile})", {}, {}, data_cost(settings).seconds) as display:
-        folder = prepare(settings, DATA, options.processes, display.data)
+    expected = data_cost(settings, recorded=imported is None)
+    with Display(f"data ({options.profile})", {}, {}, expected.seconds) as display:
+        folder = prepare(settings, DATA, options.processes, display.data, imported)
     print(folder)
     if options.action != "build":
-        _show(options.action, settings, folder)
+        _show(options.action, folder, drives_folder(settings, DATA, imported))
     return 0
 
 
-def _show(action: str, settings: StudySettings, folder: Path) -> None:
+def _show(action: str, folder: Path, drives_at: Path) -> None:
     """Make the card or the preview anew."""
     from study.card import source_drives, write_card  # noqa: PLC0415
     from study.frames import open_frames  # noqa: PLC0415
 
     store = open_frames(folder)
-    drives = source_drives(store, DATA / "episodes" / recording_key(settings))
+    drives = source_drives(store, drives_at)
     if action == "card":
         files = write_card(store, drives, folder)
         print(files[1].read_text(encoding="utf-8"))

@@ -44,7 +44,7 @@ class Display:
         self._live = Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
 
     def __enter__(self) -> Self:
-        self.say(f"{self._title}: {self._finished} of {self._total} cells finished")
+        self.say(f"{self._title}: {self._finished} of {self._total} cells finished" if self._total else self._title)
         if self._live:
             self._live.start()
         return self
@@ -119,8 +119,10 @@ class Display:
 
     def _summary(self) -> str:
         left = self.left()
-        failed = f", {self._failed} failed" if self._failed else ""
-        return f"cells {self._finished}/{self._total}{failed}" + ("" if left is None else f", about {clock(left)} left")
+        said = [f"cells {self._finished}/{self._total}"] if self._total else []
+        said += [f"{self._failed} failed"] if self._failed else []
+        said += [] if left is None else [f"about {clock(left)} left"]
+        return ", ".join(said)
 
     def tick(self, *, now: bool = False) -> None:
         """Draw again; a plain line only now and then."""
@@ -128,7 +130,7 @@ class Display:
             self._live.update(self._picture(), refresh=True)
         elif now or time.monotonic() - self._said > LINE_EVERY:
             running = "; ".join(f"{self._labels.get(key, 'data')}: {state}" for key, state in self._state.items())
-            self.say(f"{running or 'waiting'}; {self._summary()}")
+            self.say("; ".join(part for part in (running or "waiting", self._summary()) if part))
 
     def _picture(self) -> Table:
         table = Table.grid(padding=(0, 2))

@@ -498,6 +498,8 @@ def _in_view(axes: Axes, sets: Mapping[str, Any]) -> None:
 
 def _distances(axes: Axes, twins: Mapping[str, Any], title: str) -> None:
     for name, colour in SPLIT_COLOUR.items():
+        if name not in twins:  # frames of a single drive
+            continue
         within = 100 * np.array(twins[name]["within"])
         axes.plot(range(len(within)), within, SPLIT_LINE[name], color=colour, label=f"split: {name}")
     axes.set_ylim(0, 100)

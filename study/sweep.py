@@ -35,10 +35,9 @@ from study.config import (
     load_profile,
     named_files,
     parameter_counts,
-    recording_key,
 )
 from study.cost import Cost, cell_cost, clock, data_cost, size, total
-from study.data import DATA, frames_folder, prepare
+from study.data import DATA, drives_folder, frames_folder, prepare
 from study.imported import Imported, open_import
 
 EXIT_FAILED, EXIT_INTERRUPTED = 1, 130
@@ -270,8 +269,7 @@ def execute(plan: Plan, options: argparse.Namespace) -> int:
                 from study.frames import open_frames  # noqa: PLC0415
 
                 store = open_frames(frames)
-                at = plan.imported.folder if plan.imported else DATA / "episodes" / recording_key(plan.settings)
-                drives = source_drives(store, at)
+                drives = source_drives(store, drives_folder(plan.settings, DATA, plan.imported))
                 tracker.log_files(sweep_run, card_files(store, drives, frames), "data")
             with Workers(jobs, options.workers, tracker, sweep_run, queue, display) as workers:
                 failed = workers.run()

@@ -11,6 +11,7 @@ from study.birdview import MASK_BYTES
 from study.card import _others, _twins, card_files, card_text, make_card, nearest_frames, thumbnails, write_card
 from study.config import BirdviewSettings, FramesSettings
 from study.episode import read_episode
+from study.figures import data_card
 from study.frames import Frames, build_frames, open_frames
 
 VIEW = BirdviewSettings()
@@ -114,3 +115,15 @@ def test_a_split_by_frame_finds_the_twins_that_a_split_by_drive_keeps_apart():
     assert found["frame"]["twins"] > 0.95
     assert found["frame"]["same_drive"] > 0.95
     assert found["frame"]["test"] == found["episode"]["test"] == 80
+
+
+def test_frames_of_a_single_drive_are_split_by_frame_only(folder, drives):
+    card = make_card(open_frames(folder), drives)
+    labels = pd.DataFrame({"episode": np.zeros(50, int)})
+    found = _twins(Frames(pictures(50), np.zeros((50, 2, MASK_BYTES), np.uint8), labels), 0.2, 0)
+    assert "episode" not in found
+    assert found["frame"]["test"] == 10
+    for entry in card["sets"].values():
+        entry["twins"] = found
+    assert card_text(card).count("all frames are of one drive") == 2
+    data_card(card)

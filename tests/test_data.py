@@ -1,15 +1,17 @@
 """The data stage: from nothing to a frame store, once."""
 
 import shutil
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 from study.config import BadInputError, load_profile
 from study.cost import data_cost
-from study.data import frames_folder, prepare
+from study.data import frames_folder, main, prepare
 from study.frames import open_frames
 
+SWEEPS = Path(__file__).parent.parent / "sweeps"
 TINY = {
     "town": {"vehicles": 30},
     "recording": {"warm_up": 1, "duration": 4, "encoder_episodes": 2, "policy_episodes": 2},
@@ -76,3 +78,16 @@ def test_a_folder_that_cannot_be_made_is_told(settings, tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(BadInputError, match="cannot write"):
         prepare(settings, tmp_path / "file" / "data", 1, lambda *_: None)
+
+
+def test_imported_drives_have_a_card_and_a_preview_too(root, tmp_path, monkeypatch, capsys):
+    shutil.copytree(SWEEPS, tmp_path / "sweeps")
+    monkeypatch.chdir(tmp_path)
+    episodes = next((root / "episodes").iterdir())
+    assert main(["import", str(episodes), "--out", "mine"]) == 0
+    small = ("--frames.encoder", "20", "--frames.policy", "20", "--processes", "1")
+    assert main(["card", "--profile", "smoke", "--data", "mine", *small]) == 0
+    assert "4 episodes" in capsys.readouterr().out
+    assert main(["preview", "--profile", "smoke", "--data", "mine", *small]) == 0
+    assert len(list(tmp_path.glob("data/frames/*/preview/*"))) > 1
+    assert not (tmp_path / "data/episodes").exists()
