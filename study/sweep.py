@@ -15,72 +15,16 @@ import signal
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-from study.command import GRID_OPTIONS, Parser, add_options, grid_overrides, run, study_overrides
-from study.config import (
-    DEFAULT_TRACKING,
-    HEADS,
-    SWEEPS,
-    BadInputError,
-    Cell,
-    Grid,
-    StudySettings,
-    cell_key,
-    content_key,
-    frames_key,
-    load_grid,
-    load_profile,
-    named_files,
-    parameter_counts,
-)
-from study.cost import Cost, cell_cost, clock, data_cost, size, total
-from study.data import DATA, drives_folder, frames_folder, prepare
-from study.imported import Imported, open_import
+from study.command import Parser, run
+from study.config import DEFAULT_TRACKING, HEADS, BadInputError, parameter_counts
+from study.cost import Cost, cell_cost, clock, size, total
+from study.data import DATA, drives_folder, prepare
+from study.plan import Plan, add_plan_options, given_plan
 
 EXIT_FAILED, EXIT_INTERRUPTED = 1, 130
-
-
-@dataclass(frozen=True)
-class Plan:
-    """A sweep, decided: its settings and the key of each of its cells."""
-
-    grid: Grid
-    profile: str
-    settings: StudySettings
-    cells: dict[str, Cell]
-    imported: Imported | None = None
-
-    @property
-    def frames(self) -> Path:
-        """Where the frame store lies, or will lie."""
-        return frames_folder(self.settings, DATA, self.imported)
-
-    @property
-    def data_cost(self) -> Cost:
-        """Of the frame store, from nothing."""
-        return data_cost(self.settings, recorded=self.imported is None)
-
-    @property
-    def key(self) -> str:
-        """Key of the plan: the same cells under the same name."""
-        return content_key("plan", {"sweep": self.grid.name, "profile": self.profile}, tuple(self.cells), 1)
-
-
-def make_plan(name: str, profile: str, study: dict[str, Any], grid: dict[str, Any], data: Path | None = None) -> Plan:
-    """The plan of a sweep file, a profile, what the command line overrides, and imported drives if there are any.
-
-    Raises BadInputError.
-    """
-    settings, loaded = load_profile(profile, study), load_grid(name, grid)
-    imported = open_import(data) if data else None
-    if imported:
-        imported.assign(settings.frames)  # too few drives are told now
-    frames = frames_key(settings, imported.key if imported else None)
-    cells = {cell_key(settings, cell, loaded.policy_seeds, frames): cell for cell in loaded.cells()}
-    return Plan(loaded, profile, settings, cells, imported)
 
 
 # --- the command ----------------------------------------------------------------------------------------------------
@@ -96,35 +40,20 @@ def parser() -> Parser:
         "Example: python -m study.sweep heads --profile smoke --heads '[rec,full]' --encoder.epochs 50",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    made.add_argument(
-        "sweep",
-        metavar="NAME",
-        help=f"name of a sweep file in {SWEEPS}/: {', '.join(named_files(SWEEPS)) or 'none here'}",
-    )
-    made.add_argument(
-        "--profile",
-        default="laptop",
-        help=f"{', '.join(named_files(SWEEPS / 'profiles'))} (default: laptop)",
-    )
+    add_plan_options(made)
     made.add_argument("--dry-run", action="store_true", help="show what would run, what is done, and what it costs")
     made.add_argument("--json", action="store_true", help="with --dry-run: one JSON object on stdout")
     made.add_argument("--workers", type=int, default=1, metavar="N", help="cells trained at a time (default: 1)")
     made.add_argument("--device", default="auto", help="cpu, cuda, cuda:1, ... (default: cuda where there is one)")
     made.add_argument("--tracking", default=DEFAULT_TRACKING, metavar="URI", help="MLflow store (default: %(default)s)")
-    made.add_argument(
-        "--data", type=Path, metavar="FOLDER", help="imported drives (study.data import); default: our town's"
-    )
     made.add_argument("--no-report", action="store_true", help="stop when the cells are finished")
-    add_options(made, Grid, GRID_OPTIONS)
-    add_options(made, StudySettings)
     return made
 
 
 def main(args: Sequence[str]) -> int:
     """Run the command and return its exit code."""
     options = parser().parse(args)
-    overrides = study_overrides(options), grid_overrides(options)
-    plan = make_plan(options.sweep, options.profile, *overrides, options.data)
+    plan = given_plan(options)
     if options.json and not options.dry_run:
         raise BadInputError("--json goes with --dry-run; add --dry-run")
     if options.workers < 1:

@@ -16,9 +16,9 @@ from study.data import prepare
 from study.episode import file_digest, read_episode, write_episode
 from study.frames import open_frames
 from study.imported import import_drives, open_import
+from study.plan import make_plan
 from study.sim import autopilot
 from study.sim.record import record_episode
-from study.sweep import make_plan
 
 
 @pytest.fixture(scope="module")

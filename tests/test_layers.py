@@ -15,7 +15,9 @@ LAYERS = [
     {"cell", "claims"},
     {"tracking", "grid", "figures", "display", "summary"},
     {"drawings", "card", "preview"},
-    {"data", "report", "worker"},
+    {"data"},
+    {"plan"},
+    {"report", "worker"},
     {"sweep"},
 ]
 OWNERS = {
@@ -32,7 +34,7 @@ OWNERS = {
     "PIL": {"preview"},
     "typst": {"report"},
     "rich": {"display"},
-    "argparse": {"command", "sweep", "report", "data"},
+    "argparse": {"command", "plan", "sweep", "report", "data"},
 }
 
 

@@ -1,0 +1,89 @@
+"""A sweep, decided: its settings and the key of each of its cells, from a sweep file, a profile and options."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from study.command import GRID_OPTIONS, Parser, add_options, grid_overrides, study_overrides
+from study.config import (
+    SWEEPS,
+    Cell,
+    Grid,
+    StudySettings,
+    cell_key,
+    content_key,
+    frames_key,
+    load_grid,
+    load_profile,
+    named_files,
+)
+from study.cost import Cost, data_cost
+from study.data import DATA, frames_folder
+from study.imported import Imported, open_import
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a sweep file, a profile and the command line come to. `cells`: key -> cell, in the order of the grid."""
+
+    grid: Grid
+    profile: str
+    settings: StudySettings
+    cells: dict[str, Cell]
+    imported: Imported | None = None
+
+    @property
+    def frames(self) -> Path:
+        """Where the frame store lies, or will lie."""
+        return frames_folder(self.settings, DATA, self.imported)
+
+    @property
+    def data_cost(self) -> Cost:
+        """Of the frame store, from nothing."""
+        return data_cost(self.settings, recorded=self.imported is None)
+
+    @property
+    def key(self) -> str:
+        """Key of the plan: the same cells under the same name."""
+        return content_key("plan", {"sweep": self.grid.name, "profile": self.profile}, tuple(self.cells), 1)
+
+
+def make_plan(name: str, profile: str, study: dict[str, Any], grid: dict[str, Any], data: Path | None = None) -> Plan:
+    """The plan of a sweep file, a profile, what the command line overrides, and imported drives if there are any.
+
+    Raises BadInputError.
+    """
+    settings, loaded = load_profile(profile, study), load_grid(name, grid)
+    imported = open_import(data) if data else None
+    if imported:
+        imported.assign(settings.frames)  # too few drives are told now
+    frames = frames_key(settings, imported.key if imported else None)
+    cells = {cell_key(settings, cell, loaded.policy_seeds, frames): cell for cell in loaded.cells()}
+    return Plan(loaded, profile, settings, cells, imported)
+
+
+def add_plan_options(parser: Parser) -> None:
+    """What every command takes that works on a plan."""
+    parser.add_argument(
+        "sweep",
+        metavar="NAME",
+        help=f"name of a sweep file in {SWEEPS}/: {', '.join(named_files(SWEEPS)) or 'none here'}",
+    )
+    parser.add_argument(
+        "--profile",
+        default="laptop",
+        help=f"{', '.join(named_files(SWEEPS / 'profiles'))} (default: laptop)",
+    )
+    parser.add_argument(
+        "--data", type=Path, metavar="FOLDER", help="imported drives (study.data import); default: our town's"
+    )
+    add_options(parser, Grid, GRID_OPTIONS)
+    add_options(parser, StudySettings)
+
+
+def given_plan(options: argparse.Namespace) -> Plan:
+    """The plan that those options ask for. Raises BadInputError."""
+    return make_plan(options.sweep, options.profile, study_overrides(options), grid_overrides(options), options.data)
