@@ -2,6 +2,8 @@
 
 import signal
 
+pytest_plugins = ("servers",)
+
 # Tests send SIGINT to themselves and to programs that they start. A shell that runs the suite in the background has it
 # ignored, and every child would inherit that.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

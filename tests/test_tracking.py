@@ -10,13 +10,13 @@ import subprocess
 import sys
 import threading
 import time
-import urllib.request
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
+from servers import free_port
 from study.config import BadInputError, Cell, Grid, StudySettings
 from study.result import ARRAYS, CellResult
 from study.tracking import SQLITE, Tracker, TrackerLostError, masked
@@ -498,29 +498,27 @@ def test_a_uri_of_another_kind_is_refused(uri):
 
 
 @pytest.fixture
-def free_port():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
+def port():
+    return free_port()
 
 
-def test_a_server_that_is_not_there_is_one_quick_clear_error(free_port):
+def test_a_server_that_is_not_there_is_one_quick_clear_error(port):
     started = time.monotonic()
-    with pytest.raises(TrackerLostError, match=rf"http://\*\*\*@127.0.0.1:{free_port} does not answer") as caught:
-        Tracker(f"http://me:secret@127.0.0.1:{free_port}")
+    with pytest.raises(TrackerLostError, match=rf"http://\*\*\*@127.0.0.1:{port} does not answer") as caught:
+        Tracker(f"http://me:secret@127.0.0.1:{port}")
     assert time.monotonic() - started < 5
     assert "secret" not in str(caught.value)
 
 
-def test_a_server_that_never_answers_is_given_up(free_port):
-    with socket.create_server(("127.0.0.1", free_port)):
+def test_a_server_that_never_answers_is_given_up(port):
+    with socket.create_server(("127.0.0.1", port)):
         started = time.monotonic()
         with pytest.raises(TrackerLostError, match="does not answer"):
-            Tracker(f"http://127.0.0.1:{free_port}")
+            Tracker(f"http://127.0.0.1:{port}")
         assert time.monotonic() - started < 8
 
 
-def test_a_server_of_another_kind_is_one_clear_error(free_port, tmp_path):
+def test_a_server_of_another_kind_is_one_clear_error(port, tmp_path):
     class Quiet(http.server.BaseHTTPRequestHandler):
         def do_GET(self):
             self.send_error(404)
@@ -528,11 +526,11 @@ def test_a_server_of_another_kind_is_one_clear_error(free_port, tmp_path):
         def log_message(self, *args):
             pass
 
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", free_port), Quiet)
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", port), Quiet)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     try:
         with pytest.raises(BadInputError, match="gave no usable answer"):
-            Tracker(f"http://127.0.0.1:{free_port}")
+            Tracker(f"http://127.0.0.1:{port}")
     finally:
         server.shutdown()
         server.server_close()
@@ -553,56 +551,25 @@ def test_a_normal_use_prints_nothing(uri):
 # --- a server -------------------------------------------------------------------------------------------------------
 
 
-def serve(folder, port):
-    words = ["server", "--host", "127.0.0.1", "--port", str(port), "--workers", "1"]
-    words += ["--backend-store-uri", f"{SQLITE}{folder}/mlflow.db", "--artifacts-destination", str(folder / "files")]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "mlflow", *words],
-        cwd=folder,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
-    )
-    deadline = time.monotonic() + 90
-    while time.monotonic() < deadline:
-        try:
-            urllib.request.urlopen(f"http://127.0.0.1:{port}/health", timeout=1).close()
-        except OSError:
-            time.sleep(0.2)
-        else:
-            return process
-    stop(process)
-    raise AssertionError("the server did not start")
-
-
-def stop(process):
-    os.killpg(process.pid, 15)
-    process.wait(20)
-
-
 @pytest.mark.slow
-def test_a_server_lost_in_the_middle_is_one_clear_error_and_nothing_is_doubled_after(free_port, tmp_path, monkeypatch):
+def test_a_server_lost_in_the_middle_is_one_clear_error_and_nothing_is_doubled_after(tracking_server, monkeypatch):
     monkeypatch.setenv("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")
-    server = serve(tmp_path, free_port)
-    try:
-        tracker = Tracker(f"http://127.0.0.1:{free_port}")
-        planned = cells("server")
-        sweep = open_sweep(tracker, planned)
-        train(tracker, sweep, planned, "server-0")
-        run = start(tracker, sweep, planned, "server-1")
-        result = make_result(planned["server-1"], "server-1")
-        run.log("encoder", 1, {"train/loss": 0.5})
-        stop(server)
-        started = time.monotonic()
-        with pytest.raises(TrackerLostError, match=rf"http://127.0.0.1:{free_port} gave no usable answer"):
-            tracker.commit(run, result)
-        tracker.interrupt(run)
-        assert time.monotonic() - started < 20
-        server = serve(tmp_path, free_port)
-        assert tracker.commit(run, result) == run.run_id
-        assert_no_point_twice(tracker, run.run_id)
-        record = tracker.read_sweep("heads")
-        assert record.complete
-        assert_same_result(record.results["server-1"], result)
-    finally:
-        stop(server)
+    tracker = Tracker(tracking_server.uri)
+    planned = cells("server")
+    sweep = open_sweep(tracker, planned)
+    train(tracker, sweep, planned, "server-0")
+    run = start(tracker, sweep, planned, "server-1")
+    result = make_result(planned["server-1"], "server-1")
+    run.log("encoder", 1, {"train/loss": 0.5})
+    tracking_server.stop()
+    started = time.monotonic()
+    with pytest.raises(TrackerLostError, match=rf"{tracking_server.uri} gave no usable answer"):
+        tracker.commit(run, result)
+    tracker.interrupt(run)
+    assert time.monotonic() - started < 20
+    tracking_server.start()
+    assert tracker.commit(run, result) == run.run_id
+    assert_no_point_twice(tracker, run.run_id)
+    record = tracker.read_sweep("heads")
+    assert record.complete
+    assert_same_result(record.results["server-1"], result)
