@@ -12,61 +12,35 @@ since MLflow takes the time into a point's identity.
 
 from __future__ import annotations
 
-import fcntl
 import json
 import math
-import os
-import re
-import shutil
-import sqlite3
 import tempfile
 import threading
 import time
-import urllib.error
-import urllib.request
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext, suppress
+from collections.abc import Callable, Collection, Iterable, Mapping
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from study.config import DEFAULT_TRACKING, BadInputError, Cell, Grid, StudySettings, content_key, masked
-from study.result import ARRAYS, NO_SEED, CellResult, SweepRecord
+from study.points import COMMIT, Point, bands, cell_points, facts_of, flatten, points, scores_of
+from study.result import ARRAYS, CellResult, SweepRecord
+from study.store import TROUBLES, TrackerLostError, alone, few_tries, guard, open_store
 
-# Nothing phones home, nothing is printed. A lost server is asked again for about half a minute, MLflow's own default
-# being four minutes; whoever sets these differently is obeyed.
-os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
-for _name, _value in {
-    "MLFLOW_LOGGING_LEVEL": "ERROR",
-    "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",
-    "MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR": "false",
-    "MLFLOW_HTTP_REQUEST_TIMEOUT": "30",
-    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "5",
-    "MLFLOW_HTTP_REQUEST_BACKOFF_FACTOR": "1",
-    "GIT_PYTHON_REFRESH": "quiet",
-}.items():
-    os.environ.setdefault(_name, _value)
+# isort: split
+from mlflow.entities import Dataset, DatasetInput, InputTag, Metric, Param, Run, RunTag
+from mlflow.exceptions import MlflowException
+from mlflow.tracking import MlflowClient
 
-from mlflow.entities import Dataset, DatasetInput, InputTag, Metric, Param, Run, RunTag  # noqa: E402 - reads the above
-from mlflow.exceptions import MlflowException  # noqa: E402
-from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore  # noqa: E402
-from mlflow.tracking import MlflowClient  # noqa: E402
-from sqlalchemy.exc import SQLAlchemyError  # noqa: E402 - comes with mlflow, which lets its errors through
-
-SQLITE = "sqlite:///"
-SCHEMES = ("sqlite:///", "http://", "https://", "postgresql://", "postgresql+psycopg2://", "postgresql+psycopg://")
-PROBE = 3.0  # [s] a server has to answer when a tracker is opened
-FLUSH = 2.0  # [s] between two writes of live curves
 RESULT = "result"  # artifact folder of a cell run
 RESULT_FILES = (*(f"{part}.safetensors" for part in ARRAYS), "curves.parquet", "cell.json")
 PLAN_VERSION = 1
-BESIDE = "artifacts_beside_database"  # tag of an experiment whose artifacts move with its database
 VALUE_LIMIT = 4000  # characters of a parameter or tag; MLflow takes 6000 and 8000, its databases 8000
-PARENT, COMMIT, NOTE = "mlflow.parentRunId", "mlflow.source.git.commit", "mlflow.note.content"
+PARENT, NOTE = "mlflow.parentRunId", "mlflow.note.content"
+FLUSH = 2.0  # [s] between two writes of live curves
 # Columns [pixels] of the view of all cells that MLflow's pages open with `?viewStateShareKey=cells`.
 VIEW = {
     "params.`heads`": 90,
@@ -84,12 +58,6 @@ VIEW = {
 _ONE_WRITER = threading.RLock()
 
 Status = Literal["FINISHED", "FAILED", "KILLED"]
-Point = tuple[str, int, float]  # metric, epoch, value
-Numbers = NDArray[np.float64]
-
-
-class TrackerLostError(BadInputError):
-    """The store does not answer or cannot be written just now: another try may help."""
 
 
 @dataclass
@@ -125,7 +93,7 @@ class CellRun:
     def _write_on(self) -> None:
         while not self._end.wait(FLUSH):
             # What cannot be written now waits in memory; commit writes it or says why it cannot.
-            with suppress(MlflowException, SQLAlchemyError, OSError):
+            with suppress(*TROUBLES):
                 self._flush()
 
     def _flush(self) -> None:
@@ -160,80 +128,13 @@ class Tracker:
 
     def __init__(self, uri: str = DEFAULT_TRACKING, experiment: str = "study") -> None:
         """Open the store and create what is missing. Raises BadInputError when it is not there or not MLflow's."""
-        self.uri = masked(uri)
-        if not uri.startswith(SCHEMES) or uri == SQLITE:
-            raise BadInputError(
-                f"tracking URI '{self.uri}' cannot be used; give {DEFAULT_TRACKING} or http://host:port"
-            )
-        folder = None
-        self._lock: Path | None = None
-        if uri.startswith(SQLITE):
-            path = Path(uri.removeprefix(SQLITE).partition("?")[0]).absolute()
-            folder = path.parent / "artifacts"
-            self._lock = path.with_name(f".{path.name}.lock")
-            _prepare_file(path, folder, self._lock, self.uri)
-            uri = f"{SQLITE}{path}"
-        elif uri.startswith("http"):
-            _probe(uri, self.uri)
-        else:
-            folder = Path(DEFAULT_TRACKING.removeprefix(SQLITE)).absolute().parent / "artifacts"
-        with self._guard(opening=True), _few_tries():
-            self.client = MlflowClient(uri)
-            self.experiment = self._open_experiment(experiment, folder)
-            if uri.startswith(SQLITE) and folder is not None:
-                self._follow(path, folder)
+        self._store = open_store(uri)
+        self.uri, self.client = self._store.shown, self._store.client
+        with guard(self.uri, opening=True), few_tries():
+            self.experiment = self._store.experiment(experiment, _welcome)
 
-    def _open_experiment(self, name: str, folder: Path | None) -> str:
-        found = self.client.get_experiment_by_name(name)
-        if found is None:
-            with suppress(MlflowException):  # another process was faster, or the next line says what is wrong
-                self.client.create_experiment(name, str(folder) if folder else None, {BESIDE: "true"})
-            found = self.client.get_experiment_by_name(name)
-        if found is None or found.lifecycle_stage != "active":
-            raise BadInputError(
-                f"experiment '{name}' in {self.uri} cannot be used; if it is deleted, run: "
-                f"MLFLOW_TRACKING_URI={self.uri} mlflow experiments restore --experiment-id "
-                f"{found.experiment_id if found else '...'}"
-            )
-        number = str(found.experiment_id)
-        for key, value in _welcome(number).items():
-            if key not in found.tags:
-                self.client.set_experiment_tag(number, key, value)
-        return number
-
-    def _follow(self, path: Path, folder: Path) -> None:
-        """Let the database point to the artifacts beside it: MLflow stores whole paths, and folders are moved."""
-        found = self.client.get_experiment(self.experiment)
-        old, new = str(found.artifact_location), str(folder)
-        if old == new or BESIDE not in found.tags:  # without it, someone keeps them elsewhere on purpose
-            return
-        with sqlite3.connect(path, timeout=20) as database:
-            database.execute(
-                "UPDATE experiments SET artifact_location = ? WHERE experiment_id = ?", (new, int(self.experiment))
-            )
-            database.execute(
-                "UPDATE runs SET artifact_uri = ? || substr(artifact_uri, ?) WHERE substr(artifact_uri, 1, ?) = ?",
-                (new, len(old) + 1, len(old) + 1, f"{old}/"),
-            )
-        database.close()
-
-    @contextmanager
-    def _guard(self, *, opening: bool = False) -> Iterator[None]:
-        """Turn the store's troubles into one clear error; mistakes of this program stay what they are."""
-        try:
-            yield
-        except (MlflowException, SQLAlchemyError, OSError, ImportError) as error:  # or a database's driver is missing
-            code = getattr(error, "error_code", None)
-            if code in ("INVALID_PARAMETER_VALUE", "BAD_REQUEST") and not opening:
-                raise
-            text = " ".join(masked(str(error)).split())[:400]
-            step = "start it, or choose another with --tracking"
-            if self.uri.startswith("sqlite"):
-                step = "look at disk space and rights, or choose another with --tracking"
-            if "db upgrade" in text:
-                step = f"copy the file, then run: mlflow db upgrade {self.uri}"
-            # `from None`: what lies below may name credentials.
-            raise TrackerLostError(f"the tracking store {self.uri} gave no usable answer: {text}; {step}") from None
+    def _guard(self) -> AbstractContextManager[None]:
+        return guard(self.uri)
 
     # --- sweeps ---------------------------------------------------------------------------------------------------
 
@@ -260,7 +161,7 @@ class Tracker:
         key = content_key("sweep run", plan, (), PLAN_VERSION)
         name = f"{grid.name} ({profile})"
         facts = {name: value for name, value in provenance.items() if name != "diff"}
-        with self._guard(), _alone(self._lock):
+        with self._guard(), alone(self._store.lock):
             sweeps = self._search("tags.kind = 'sweep'")
             latest = max((_opened(run) for run in sweeps), default=0)
             tags = {
@@ -269,7 +170,7 @@ class Tracker:
                 "reused": self._reused(planned, name),
                 **({COMMIT: str(provenance["commit"])} if provenance.get("commit") else {}),
             }
-            params = _params({**_flat(plan["grid"]), "profile": profile, **_flat(plan["settings"])})
+            params = _params({**flatten(plan["grid"]), "profile": profile, **flatten(plan["settings"])})
             mine = [run for run in sweeps if run.data.tags.get("plan_key") == key]
             if mine:
                 run_id = str(mine[0].info.run_id)
@@ -283,7 +184,7 @@ class Tracker:
                     self.client.delete_run(created)
             for run in sweeps:
                 # A database file belongs to one machine, where one sweep runs at a time: others were killed.
-                if self._lock and run.info.status == "RUNNING" and run.info.run_id != run_id:
+                if self._store.database and run.info.status == "RUNNING" and run.info.run_id != run_id:
                     self._close_cells(run.info.run_id)
                     self._close(run.info.run_id, "KILLED", {"reason": "another sweep was started"})
             _insert(self.client.log_batch, run_id, params=params)
@@ -305,7 +206,7 @@ class Tracker:
 
     def close_sweep(self, sweep_run_id: str, status: Status) -> None:
         """End a sweep run, and whatever cell run under it still says RUNNING. Quick when it was stopped (KILLED)."""
-        with self._guard(), _few_tries() if status == "KILLED" else nullcontext():
+        with self._guard(), few_tries() if status == "KILLED" else nullcontext():
             self._close_cells(sweep_run_id)
             planned = self._json(sweep_run_id, "plan.json")["planned"]
             done = len(self._finished(planned))
@@ -383,7 +284,7 @@ class Tracker:
             "fraction": cell.fraction,
             "encoder_seed": cell.encoder_seed,
             "policy_seeds": policy_seeds,
-            **_flat(settings.model_dump(mode="json")),
+            **flatten(settings.model_dump(mode="json")),
         }
         with self._guard():
             before = self._search(f"tags.kind = 'cell' and tags.cell_key = '{key}'")
@@ -428,7 +329,7 @@ class Tracker:
             scores = scores_of(result)
             self._log_seeds(cell_run, result.curves, scores)
             cell_run.finish(cell_points(result.curves))
-            numbers, words = _facts(result.facts)
+            numbers, words = facts_of(result.facts)
             for ending, values in bands(scores).items():
                 numbers |= {f"final/{name}{ending}": v for name, v in zip(scores.columns, values, strict=True)}
             self.client.log_batch(
@@ -461,7 +362,7 @@ class Tracker:
     def interrupt(self, cell_run: CellRun) -> None:
         """End an attempt that was stopped, quickly; when the store does not answer, the next attempt closes it."""
         cell_run.stop(wait=False)
-        with suppress(TrackerLostError), self._guard(), _few_tries():
+        with suppress(TrackerLostError), self._guard(), few_tries():
             self._close(cell_run.run_id, "KILLED", {"reason": "stopped"})
 
     def load_result(self, run_id: str) -> CellResult:
@@ -528,46 +429,6 @@ class Tracker:
         return content
 
 
-# --- curves ---------------------------------------------------------------------------------------------------------
-
-
-def scores_of(result: CellResult) -> pd.DataFrame:
-    """Mean of the last five epochs on test frames (Sec. V-B): one row per policy seed, one column per metric."""
-    from study.stats import final_scores  # noqa: PLC0415 - scipy, which reading what is finished does not need
-
-    cell = result.cell
-    table = result.curves.assign(heads=cell.heads, fraction=cell.fraction, encoder_seed=cell.encoder_seed)
-    return final_scores(table).pivot_table(index="policy_seed", columns="metric", values="value")
-
-
-def bands(values: pd.DataFrame) -> dict[str, Numbers]:
-    """Mean, and `/sd`, `/low`, `/high`, over the seeds (rows), of each column; the ends are NaN for one seed."""
-    from study.stats import t_limits  # noqa: PLC0415 - as above
-
-    low, high = t_limits(values.to_numpy(np.float64))
-    mean, sd = values.mean(axis=0).to_numpy(np.float64), values.std(axis=0).to_numpy(np.float64)
-    return {"": mean, "/sd": sd, "/low": low, "/high": high}
-
-
-def cell_points(curves: pd.DataFrame) -> Iterator[Point]:
-    """Points of a cell run: the encoder's curves, and mean, sd and interval over the policy seeds."""
-    own = curves["policy_seed"] == NO_SEED
-    yield from points(curves[own])
-    for names, rows in curves[~own].groupby(["stage", "split", "metric"], sort=False):
-        wide = rows.pivot_table(index="policy_seed", columns="epoch", values="value", dropna=False)
-        for ending, values in bands(wide).items():
-            name = "/".join(str(part) for part in names) + ending
-            for epoch, value in zip(wide.columns, values.tolist(), strict=True):
-                if not ending or math.isfinite(value):
-                    yield name, int(epoch), value
-
-
-def points(curves: pd.DataFrame) -> Iterator[Point]:
-    """Name, epoch and value of each row."""
-    names = curves["stage"] + "/" + curves["split"] + "/" + curves["metric"]
-    return zip(names.tolist(), curves["epoch"].tolist(), curves["value"].tolist(), strict=True)
-
-
 # --- plain values ---------------------------------------------------------------------------------------------------
 
 
@@ -575,41 +436,15 @@ def _short(text: str) -> str:
     return text if len(text) <= VALUE_LIMIT else f"{text[: VALUE_LIMIT - 40]}... [{len(text)} characters, cut]"
 
 
-def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested mappings as one, with dotted names."""
-    flat: dict[str, Any] = {}
-    for name, value in values.items():
-        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
-    return flat
-
-
 def _params(values: Mapping[str, Any]) -> list[Param]:
     texts = {name: value if isinstance(value, str) else json.dumps(value) for name, value in values.items()}
     return [Param(name, _short(text)) for name, text in texts.items()]
 
 
-def _facts(facts: Mapping[str, Any]) -> tuple[dict[str, float], dict[str, str]]:
-    """What a cell says of itself: numbers as metrics such as `seconds/encoder`, words as tags."""
-    numbers: dict[str, float] = {}
-    words: dict[str, str] = {}
-    origin = facts.get("provenance", {})
-    if origin.get("commit"):
-        words[COMMIT] = str(origin["commit"])
-    for name in ("dirty", "python", "platform", "cpu"):
-        if name in origin:
-            words[name] = str(origin[name])
-    for name, value in _flat({name: value for name, value in facts.items() if name != "provenance"}).items():
-        if isinstance(value, int | float) and not isinstance(value, bool):
-            numbers[name.replace(".", "/")] = float(value)
-        else:
-            words[name] = value if isinstance(value, str) else json.dumps(value)
-    return numbers, words
-
-
 def _dataset(data: Mapping[str, Any]) -> DatasetInput:
     digest = str(data.get("key") or content_key("data", dict(data), (), PLAN_VERSION))
     source = json.dumps({"tags": {"frame store": digest, "manifest": "data.json of the sweep run"}})
-    profile = json.dumps({name: value for name, value in _flat(data).items() if isinstance(value, int | float)})
+    profile = json.dumps({name: value for name, value in flatten(data).items() if isinstance(value, int | float)})
     entity = Dataset("frames", digest[:36], "code", source, profile=profile[:100_000])
     return DatasetInput(entity, [InputTag("mlflow.data.context", "train and test")])
 
@@ -646,74 +481,3 @@ def _insert(write: Callable[..., Any], *what: Any, **more: Any) -> None:
         if error.error_code != "BAD_REQUEST":
             raise
         write(*what, **more)
-
-
-# --- stores ---------------------------------------------------------------------------------------------------------
-
-
-@contextmanager
-def _few_tries() -> Iterator[None]:
-    """Ask a server once or twice only, and a few seconds at most."""
-    names = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1", "MLFLOW_HTTP_REQUEST_TIMEOUT": str(int(PROBE))}
-    before = {name: os.environ.get(name) for name in names}
-    os.environ.update(names)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is not None:
-                os.environ[name] = value
-
-
-@contextmanager
-def _alone(lock: Path | None) -> Iterator[None]:
-    """Hold a file's lock; a process that dies lets go of it. Without a file there is nothing to hold."""
-    if lock is None:
-        yield
-        return
-    with lock.open("w") as stream:
-        fcntl.flock(stream, fcntl.LOCK_EX)
-        yield
-
-
-def _probe(uri: str, shown: str) -> None:
-    """Raise TrackerLostError when a server does not answer at once."""
-    url = re.sub(r"//[^/@]*@", "//", uri).rstrip("/") + "/health"
-    try:
-        with urllib.request.urlopen(url, timeout=PROBE):  # noqa: S310 - the scheme is http or https
-            pass
-    except urllib.error.HTTPError:
-        pass  # it answers; whether it is MLflow shows at the first question
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "reason", error)
-        raise TrackerLostError(
-            f"the tracking server {shown} does not answer ({reason}); start it (mlflow server), "
-            f"check the address, or leave --tracking out to use {DEFAULT_TRACKING}"
-        ) from None
-
-
-def _prepare_file(path: Path, artifacts: Path, lock: Path, shown: str) -> None:
-    """Make the database whole or not at all; refuse a file that is not MLflow's."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if not path.exists():
-            # MLflow needs seconds for its tables; a process killed in between would leave a database half made.
-            with _alone(lock):
-                if not path.exists():
-                    drafts = path.with_name(f".{path.name}.draft")  # a folder, since SQLite writes a journal beside
-                    shutil.rmtree(drafts, ignore_errors=True)
-                    drafts.mkdir()
-                    draft = drafts / path.name
-                    SqlAlchemyStore(f"{SQLITE}{draft}", str(artifacts))._dispose_engine()  # noqa: SLF001 - closes it
-                    draft.replace(path)
-                    shutil.rmtree(drafts)
-            return
-        with sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True, timeout=20) as database:
-            tables = {row[0] for row in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
-        database.close()
-    except (OSError, sqlite3.Error, SQLAlchemyError, MlflowException) as error:
-        raise BadInputError(
-            f"{shown} cannot be used as a tracking store: {error}; move the file away or give another --tracking"
-        ) from None
-    if not {"experiments", "runs", "alembic_version"} <= tables:
-        raise BadInputError(f"{shown} is a database, but not MLflow's; give another file with --tracking")

@@ -17,9 +17,10 @@ import pandas as pd
 import pytest
 
 from servers import free_port
-from study.config import BadInputError, Cell, Grid, StudySettings
+from study.config import BadInputError, Cell, Grid, StudySettings, masked
 from study.result import ARRAYS, CellResult
-from study.tracking import SQLITE, Tracker, TrackerLostError, masked
+from study.store import SQLITE, TrackerLostError
+from study.tracking import Tracker
 
 EPOCHS, SEEDS = 6, 3
 SETTINGS = StudySettings()
