@@ -10,9 +10,12 @@ from __future__ import annotations
 import dataclasses
 import multiprocessing
 import shutil
+import signal
 import traceback
 from dataclasses import dataclass
+from multiprocessing import forkserver
 from multiprocessing.connection import Connection, wait
+from multiprocessing.context import ForkServerContext
 from typing import Any, Self
 
 from study.command import obey_parent
@@ -53,6 +56,21 @@ def serve(job: CellJob, parent: Connection) -> None:
 
 
 # --- the parent's side ----------------------------------------------------------------------------------------------
+
+
+def fork_server() -> ForkServerContext:
+    """Where children come from: a process that loads torch once, so that each of them starts within a moment.
+
+    Ctrl-C reaches every process of a terminal; it is the parent's to answer, so the server is born deaf to it.
+    """
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["study.cell", "study.worker"])
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        forkserver.ensure_running()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    return context
 
 
 @dataclass
@@ -113,8 +131,7 @@ class Workers:
             self._commit(job, ticket, run)
             return
         here, there = multiprocessing.Pipe(duplex=False)
-        context = multiprocessing.get_context("spawn")
-        process = context.Process(target=serve, args=(job, there), name=job.cell.label, daemon=True)
+        process = fork_server().Process(target=serve, args=(job, there), name=job.cell.label, daemon=True)
         process.start()
         there.close()
         self._running.append(Worker(job, ticket, run, process, here))
