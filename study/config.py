@@ -11,7 +11,7 @@ import itertools
 import json
 import re
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -62,6 +62,7 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
+Model = TypeVar("Model", bound=BaseModel)
 Share = Annotated[float, Field(ge=0, le=1)]
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -374,6 +375,14 @@ def explain(error: ValidationError, source: str) -> BadInputError:
     return BadInputError(f"{source}: " + "; ".join(lines))
 
 
+def validated(model: type[Model], content: object, source: str) -> Model:
+    """The content as that model. Raises BadInputError that names the source and every field that is wrong."""
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        raise explain(error, source) from error
+
+
 def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
     """`base` with the values of `over`, nested mappings merged."""
     merged = dict(base)
@@ -388,10 +397,7 @@ def load_grid(name: str, overrides: dict[str, Any] | None = None, folder: Path =
     files = named_files(folder)
     if name not in files:
         raise one_of("sweep", name, files or [f"nothing: there are no sweep files in {folder.absolute()}"])
-    try:
-        return Grid.model_validate(merge(read_yaml(files[name]), overrides or {}) | {"name": name})
-    except ValidationError as error:
-        raise explain(error, f"sweep {name}") from error
+    return validated(Grid, merge(read_yaml(files[name]), overrides or {}) | {"name": name}, f"sweep {name}")
 
 
 def load_profile(name: str, overrides: dict[str, Any] | None = None, folder: Path = SWEEPS) -> StudySettings:
@@ -399,7 +405,4 @@ def load_profile(name: str, overrides: dict[str, Any] | None = None, folder: Pat
     files = named_files(folder / "profiles")
     if name not in files:
         raise one_of("profile", name, files)
-    try:
-        return StudySettings.model_validate(merge(read_yaml(files[name]), overrides or {}))
-    except ValidationError as error:
-        raise explain(error, f"profile {name}") from error
+    return validated(StudySettings, merge(read_yaml(files[name]), overrides or {}), f"profile {name}")

@@ -2,6 +2,8 @@
 
 python -m study.report heads
 python -m study.report datasize --profile smoke --tracking http://127.0.0.1:5000
+python -m study.report heads --format md > heads.md
+python -m study.report compare reports/reference/heads heads:laptop@http://127.0.0.1:5000
 """
 
 from __future__ import annotations
@@ -12,9 +14,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from study.command import Parser, run
-from study.config import DEFAULT_TRACKING, SWEEPS, named_files
+from study.config import DEFAULT_TRACKING, SWEEPS, BadInputError, masked, named_files
 
 if TYPE_CHECKING:  # the command answers --help without the libraries that only a report needs
+    from study.comparison import Report
     from study.result import SweepRecord
     from study.tracking import Tracker
 
@@ -87,13 +90,22 @@ def parser() -> Parser:
     """The command line."""
     made = Parser(
         prog="study.report",
-        description="Write the report of a sweep from what MLflow holds: PDF, figures, numbers and the tidy table.",
-        epilog="Example: python -m study.report heads --profile smoke",
+        usage="python -m study.report SWEEP [--profile P] [--format {pdf,md}] [--tracking URI] [--out DIR]\n"
+        "       python -m study.report compare A B [--tracking URI]",
+        description="Write the report of a sweep from what MLflow holds: PDF, figures, numbers and the tidy table; or "
+        "its tables as Markdown on stdout; or set two sweeps side by side, as Markdown on stdout.",
+        epilog="A and B: each a report.json, a folder that holds one, or NAME[:PROFILE][@URI] of a sweep in MLflow. "
+        "Examples: python -m study.report heads --profile smoke; "
+        "python -m study.report compare reports/reference/heads heads:laptop",
     )
     made.add_argument(
-        "sweep", help=f"name of a sweep that was run, such as {', '.join(named_files(SWEEPS)) or 'heads'}"
+        "words",
+        nargs="+",
+        metavar="SWEEP",
+        help=f"name of a sweep that was run, such as {', '.join(named_files(SWEEPS)) or 'heads'}; or compare A B",
     )
     made.add_argument("--profile", help="of the sweep (default: that of its latest run)")
+    made.add_argument("--format", choices=("pdf", "md"), default="pdf", help="default: %(default)s")
     made.add_argument("--tracking", default=DEFAULT_TRACKING, metavar="URI", help="MLflow store (default: %(default)s)")
     made.add_argument("--out", type=Path, default=Path("reports"), metavar="DIR", help="default: %(default)s")
     return made
@@ -102,10 +114,47 @@ def parser() -> Parser:
 def main(args: Sequence[str]) -> int:
     """Run the command and return its exit code."""
     options = parser().parse(args)
+    name, *rest = options.words
+    if len(rest) != (2 if name == "compare" else 0):
+        raise BadInputError(
+            f"'{' '.join(options.words)}' names {len(options.words)} things; give one sweep, or: compare A B"
+        )
+    if name == "compare":
+        print(side_by_side(rest[0], rest[1], options.tracking), end="")
+        return 0
     from study.tracking import Tracker  # noqa: PLC0415
 
-    print(publish(Tracker(options.tracking), options.sweep, options.profile, options.out))
+    tracker = Tracker(options.tracking)
+    if options.format == "md":
+        from study.markdown import written  # noqa: PLC0415
+        from study.summary import numbers  # noqa: PLC0415
+
+        print(written(numbers(tracker.read_sweep(name, options.profile))), end="")
+    else:
+        print(publish(tracker, name, options.profile, options.out))
     return 0
+
+
+def side_by_side(first: str, second: str, tracking: str) -> str:
+    """Two sweeps' comparison as Markdown, each named by a path or as NAME[:PROFILE][@URI]."""
+    from study.comparison import compare  # noqa: PLC0415
+
+    return compare(_report(first, tracking), _report(second, tracking), (masked(first), masked(second)))
+
+
+def _report(source: str, tracking: str) -> Report:
+    from study.comparison import checked, read_report  # noqa: PLC0415
+
+    sweep, _, uri = source.partition("@")
+    if Path(source).exists() or "/" in sweep or sweep.endswith(".json"):
+        return read_report(Path(source))
+    from study.summary import numbers  # noqa: PLC0415
+    from study.tracking import Tracker  # noqa: PLC0415
+
+    name, _, profile = sweep.partition(":")
+    # Through JSON, so that both sides have been the same way.
+    made = numbers(Tracker(uri or tracking).read_sweep(name, profile or None))
+    return checked(json.loads(json.dumps(made)), masked(source))
 
 
 if __name__ == "__main__":

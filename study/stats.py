@@ -85,11 +85,16 @@ def encoders(values: pd.Series | pd.DataFrame) -> int:
     return len(values.index.get_level_values("encoder_seed").unique())
 
 
-def by_encoder(values: pd.Series) -> Array:
-    """The sampling units: with one encoder its policies' values, with several the mean of each encoder."""
+def by_seed(values: pd.Series) -> pd.Series:
+    """The sampling units by seed: with one encoder its policies' values, with several the mean of each encoder."""
     if encoders(values) == 1:
-        return values.to_numpy(np.float64)
-    return values.groupby(level="encoder_seed").mean().to_numpy(np.float64)
+        return values.droplevel("encoder_seed")
+    return values.groupby(level="encoder_seed").mean()
+
+
+def by_encoder(values: pd.Series) -> Array:
+    """The sampling units' values."""
+    return by_seed(values).to_numpy(np.float64)
 
 
 def design(curves: Iterable[pd.DataFrame]) -> str:
@@ -253,6 +258,22 @@ def sign_flip(differences: Array) -> float:
         return float(np.mean(np.abs(sums) >= observed))
     signs = generator("sign flip").choice([-1.0, 1.0], size=(DRAWS, n))
     return float((1 + np.sum(np.abs(signs @ differences) >= observed)) / (1 + DRAWS))
+
+
+def paired_t(differences: Sequence[float]) -> Estimate:
+    """Mean of paired differences with Student's interval."""
+    values = np.asarray(differences, np.float64)
+    low, high = t_limits(values)
+    return Estimate(float(values.mean()), float(low), float(high), len(values), "t, paired by seed")
+
+
+def welch(first: Sequence[float], second: Sequence[float], level: float = LEVEL) -> Estimate:
+    """Difference of the means of two separate samples, first minus second, with Welch's interval; n of the smaller."""
+    value, n, kind = float(np.mean(first) - np.mean(second)), min(len(first), len(second)), "Welch's t, two samples"
+    if n < 2:
+        return Estimate(value, math.nan, math.nan, n, "no interval from one value", level)
+    found = scipy_stats.ttest_ind(first, second, equal_var=False).confidence_interval(level)
+    return Estimate(value, float(found.low), float(found.high), n, kind, level)
 
 
 def holm(p_values: Sequence[float]) -> list[float]:

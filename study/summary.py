@@ -160,7 +160,7 @@ def _spread(curves: pd.DataFrame) -> Numbers:
     found = stats.mean_interval(final)
     middle = float(stats.interquartile_mean(final.to_numpy()))
     sd = float(final.std(ddof=1)) if len(final) > 1 else math.nan
-    return {"mean": found.value, "sd": sd, "iqm": middle, **_interval(found)}
+    return {"mean": found.value, "sd": sd, "iqm": middle, **_interval(found), "units": stats.by_seed(final).to_dict()}
 
 
 def _interval(found: Estimate) -> Numbers:

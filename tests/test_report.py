@@ -12,6 +12,7 @@ from simulated import DATASIZE_GRID, HEADS_GRID, World, simulate
 from study import report
 from study.config import BadInputError, Grid
 from study.report import build_report
+from study.summary import numbers
 
 
 def pages(pdf):
@@ -159,7 +160,9 @@ def tracker(tmp_path_factory):
     return Tracker(f"sqlite:///{tmp_path_factory.mktemp('tracking')}/mlflow.db")
 
 
-def test_publish_builds_from_the_tracker_alone_and_logs_what_it_made(tracker, tmp_path):
+@pytest.fixture(scope="module")
+def committed(tracker):
+    """A record, and the sweep run that holds it."""
     record = simulate(Grid(name="pair", title="T", heads=("rec", "full"), policy_seeds=3), World(epochs=6))
     run = tracker.open_sweep(
         record.grid, record.profile, record.settings, record.planned, record.data, record.provenance
@@ -168,10 +171,35 @@ def test_publish_builds_from_the_tracker_alone_and_logs_what_it_made(tracker, tm
         cell_run = tracker.start_cell(run, record.planned[key], key, record.settings, record.grid.policy_seeds)
         tracker.commit(cell_run, result)
     tracker.close_sweep(run, "FINISHED")
+    return record, run
+
+
+def test_publish_builds_from_the_tracker_alone_and_logs_what_it_made(tracker, committed, tmp_path):
+    record, run = committed
     pdf = report.publish(tracker, "pair", None, tmp_path / "reports")
     assert pdf.read_bytes() == build_report(record, tmp_path / "direct").read_bytes()
     logged = {item.path for folder in ("report", "figures") for item in tracker.client.list_artifacts(run, folder)}
     assert {"report/pair.pdf", "report/report.json", "figures/test_compare_heads.svg"} <= logged
+
+
+def test_compare_takes_files_folders_and_sweeps_in_mlflow(tracker, committed, tmp_path, capsys):
+    (tmp_path / "report.json").write_text(json.dumps(numbers(committed[0])))
+    for other in (tmp_path / "report.json", f"pair@{tracker.uri}", f"pair:laptop@{tracker.uri}"):
+        assert report.main(["compare", str(tmp_path), str(other)]) == 0
+        assert "rec (the same result), full (the same result)" in capsys.readouterr().out
+    with pytest.raises(BadInputError, match=r"no sweep 'pair \(paper\)'"):
+        report.main(["compare", str(tmp_path), "pair:paper", "--tracking", tracker.uri])
+    with pytest.raises(BadInputError, match=r"cannot read nowhere/report\.json"):
+        report.main(["compare", str(tmp_path), "nowhere/report.json"])
+    with pytest.raises(BadInputError, match="compare A B"):
+        report.main(["compare", str(tmp_path)])
+
+
+def test_format_md_prints_tables_and_writes_nothing(tracker, committed, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert report.main(["pair", "--format", "md", "--tracking", tracker.uri]) == 0
+    assert "| full | 3 |" in capsys.readouterr().out
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_sweep_that_was_never_run_is_bad_input(tracker, tmp_path):

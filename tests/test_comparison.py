@@ -1,0 +1,136 @@
+import json
+import re
+
+import pytest
+
+from simulated import HEADS_GRID, World, simulate
+from study.comparison import checked, compare, difference, read_report
+from study.config import BadInputError, Grid
+from study.summary import numbers
+
+SMALL = Grid(name="small", title="Small | <b>study</b>", heads=("rec", "full"), policy_seeds=4, claims=("H4",))
+FAST = World(epochs=12)
+
+
+def made(record):
+    """The content of a report.json, having been through JSON."""
+    return json.loads(json.dumps(numbers(record)))
+
+
+@pytest.fixture(scope="module")
+def content():
+    return made(simulate(SMALL, FAST))
+
+
+@pytest.fixture(scope="module")
+def pair():
+    """Two commits' sweeps on the same frames: in the second, full is worse than rec."""
+    accuracy = {"rec": 0.835, "rec+pred": 0.847, "rec+plan": 0.862, "full": 0.60}
+    other = made(simulate(HEADS_GRID, World(epochs=12, accuracy=accuracy), seed=1))
+    other["provenance"] |= {"commit": "fedcba98" * 5}
+    other["rules"] |= {"accuracy_margin": 0.02}
+    return checked(made(simulate(HEADS_GRID, FAST)), "a"), checked(other, "b")
+
+
+@pytest.fixture(scope="module")
+def text(pair):
+    return compare(*pair, ("old", "new"))
+
+
+def row(text, *starts):
+    """Cells of the first row that starts so."""
+    line = next(line for line in text.splitlines() if line.startswith("| " + " | ".join(starts)))
+    return [cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]]
+
+
+def test_a_comparison_shows_what_differs_and_only_that(text):
+    assert row(text, "commit")[1:] == ["`0123456789abcdef0123456789abcdef01234567`", f"`{'fedcba98' * 5}`"]
+    assert row(text, "rules accuracy\\_margin")[1:] == ["`0.005`", "`0.02`"]
+    assert "encoder.lr" not in text
+    assert re.search(r"Nothing differs in: .*data.*settings", text)
+
+
+def test_scores_stand_side_by_side_with_the_difference_and_its_interval(pair, text):
+    first, second = (next(score for score in one.scores if score.heads == "full") for one in pair)
+    cells = row(text, "full")
+    shift = second.accuracy.mean - first.accuracy.mean
+    assert cells[1] == f"{100 * first.accuracy.mean:.2f} (15)"
+    assert cells[3] == f"\N{MINUS SIGN}{-100 * shift:.2f}"
+    found = difference(first.accuracy, second.accuracy, same_data=True)
+    assert found.low < shift < found.high < 0
+
+
+def test_an_order_that_changed_and_verdicts_that_changed_are_named(text):
+    order = row(text, "100 %")
+    assert order[1] == "full > rec+plan > rec+pred > rec"
+    assert order[2].endswith("> full")
+    assert order[3] == "**another**"
+    assert re.search(r"Verdicts that changed: .*H2", text)
+    assert row(text, "**H2**")[2].startswith("**not reproduced**")
+
+
+def test_seeds_are_paired_on_the_same_frames_only(pair):
+    first, second = (one.scores[0].accuracy for one in pair)
+    assert "paired" in difference(first, second, same_data=True).kind
+    assert "Welch" in difference(first, second, same_data=False).kind
+    fewer = second.model_copy(update={"units": {0: 0.8, 1: 0.9}})
+    assert "Welch" in difference(first, fewer, same_data=True).kind
+
+
+def test_a_sweep_beside_itself_differs_in_nothing(pair):
+    text = compare(pair[0], pair[0], ("x", "x"))
+    assert "rec (the same result), rec+pred (the same result)" in text
+    assert row(text, "full")[3:] == ["0.00", "0.00 to 0.00"]
+    assert "Verdicts that changed: none" in text
+    assert "commit" in re.search(r"Nothing differs in: (.*)\.", text).group(1)
+
+
+def test_cells_of_one_sweep_only_are_named(content):
+    whole = checked(made(simulate(HEADS_GRID, FAST)), "whole")
+    text = compare(checked(content, "part"), whole, ("part", "whole"))
+    assert "Only in the second: rec+pred, rec+plan." in text
+    assert row(text, "100 %")[3] == "the same"
+
+
+def test_nothing_in_common_is_said(content):
+    grid = SMALL.model_copy(update={"heads": ("rec+plan",)})
+    text = compare(checked(content, "a"), checked(made(simulate(grid, FAST)), "b"), ("a", "b"))
+    assert "No head set and fraction is finished in both" in text
+    empty = simulate(SMALL, FAST, unfinished=[cell.label for cell in SMALL.cells()])
+    assert "No head set" in compare(checked(made(empty), "a"), checked(content, "b"), ("a", "b"))
+
+
+def test_words_of_a_report_stay_words(content):
+    content = content | {"claims": [content["claims"][0] | {"reason": "a | b\n<script>", "findings": []}]}
+    one = checked(content, "a")
+    text = compare(one, one, ("a|b", "`c`"))
+    assert "Small \\| &lt;b>study&lt;/b>" in text
+    assert "a \\| b &lt;script>" in text
+    assert "`a b`" in text
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"format_version": 99}, "report format 99"),
+        ({"scores": [{"cell": "rec"}]}, "scores.0.heads"),
+        ({"rules": {"alpha": "many"}}, "rules.alpha"),
+        ({"sweep": None}, "sweep"),
+        ({"scores": None}, "scores"),
+    ],
+)
+def test_a_report_that_is_not_whole_is_refused_by_name(content, change, message, tmp_path):
+    (tmp_path / "report.json").write_text(json.dumps(content | change))
+    with pytest.raises(BadInputError, match=rf"report\.json.*{message}"):
+        read_report(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [("{", "is no JSON"), ("[]", "no report of this program"), ("{}", "format_version"), ("[" * 100_000, "is no JSON")],
+)
+def test_a_file_that_is_no_report_is_refused(text, message, tmp_path):
+    file = tmp_path / "other.json"
+    file.write_text(text)
+    with pytest.raises(BadInputError, match=message):
+        read_report(file)
