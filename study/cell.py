@@ -125,10 +125,14 @@ def run_cell(job: CellJob, log: Log, progress: Progress) -> CellResult:
 
 def choose_device(job: CellJob) -> str:
     """The torch device for a job. Raises BadInputError for one that is not there."""
-    if job.device == "auto":
-        gpus = torch.cuda.device_count()
-        return f"cuda:{job.slot % gpus}" if gpus else "cpu"
-    return str(check_device(job.device))
+    return str(check_device(slot_device(job.device, job.slot, torch.cuda.device_count())))
+
+
+def slot_device(device: str, slot: int, gpus: int) -> str:
+    """The device of the worker in a slot: GPUs go round, unless one is named; "auto" is the CPU where there is none."""
+    if device == "auto" and not gpus:
+        return "cpu"
+    return f"cuda:{slot % gpus}" if gpus and device in {"auto", "cuda"} else device
 
 
 def device_name(device: str) -> str:

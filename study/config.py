@@ -284,6 +284,11 @@ def recording_key(settings: StudySettings) -> str:
     return content_key("episodes", own, (), FORMAT_VERSIONS["episodes"])
 
 
+def drive_name(seed: int) -> str:
+    """Name of the drive of that seed, in the folder of its recording key."""
+    return f"{seed:08d}"
+
+
 def frames_key(settings: StudySettings, source: str | None = None) -> str:
     """Key of the frame store; `source` stands for the drives when they are not our town's."""
     own = {

@@ -32,17 +32,21 @@ class Cost:
     bytes: int
 
 
+def recording_cost(settings: StudySettings) -> Cost:
+    """Of recording the drives."""
+    recording = settings.recording
+    steps = (recording.encoder_episodes + recording.policy_episodes) * settings.town.vehicles * STEP_HZ
+    return Cost(
+        steps * (recording.warm_up + recording.duration) / VEHICLE_FRAMES_PER_S,
+        int(steps * recording.duration * STATE_BYTES),
+    )
+
+
 def data_cost(settings: StudySettings, *, recorded: bool = True) -> Cost:
     """Of recording the drives, unless they are there already, and rendering the frames."""
-    recording, frames = settings.recording, settings.frames
-    drives = recording.encoder_episodes + recording.policy_episodes if recorded else 0
-    steps = drives * settings.town.vehicles * STEP_HZ
-    simulated = steps * (recording.warm_up + recording.duration)
-    images = frames.encoder + frames.policy
-    return Cost(
-        simulated / VEHICLE_FRAMES_PER_S + images / FRAMES_PER_S,
-        int(steps * recording.duration * STATE_BYTES + images * FRAME_BYTES),
-    )
+    images = settings.frames.encoder + settings.frames.policy
+    rendering = Cost(images / FRAMES_PER_S, images * FRAME_BYTES)
+    return total([recording_cost(settings), rendering]) if recorded else rendering
 
 
 def cell_cost(settings: StudySettings, cell: Cell, policy_seeds: int) -> Cost:

@@ -18,8 +18,17 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from study.command import Parser, add_options, run, study_overrides
-from study.config import SWEEPS, BadInputError, StudySettings, frames_key, load_profile, named_files, recording_key
-from study.cost import data_cost, size
+from study.config import (
+    SWEEPS,
+    BadInputError,
+    StudySettings,
+    drive_name,
+    frames_key,
+    load_profile,
+    named_files,
+    recording_key,
+)
+from study.cost import data_cost, recording_cost, size
 from study.imported import Imported, describe, import_drives, open_import
 from study.provenance import cores
 
@@ -55,12 +64,16 @@ def prepare(
     if (folder / "manifest.json").is_file():
         open_frames(folder, check=True)  # a store that was damaged since is told now, not by every cell
         return folder
-    _check_room(settings, root, imported)
+    _check_room(
+        root,
+        data_cost(settings, recorded=imported is None).bytes,
+        [drives_folder(settings, root), folder.with_name(f".{folder.name}.building")],
+    )
     if imported:
         encoder_drives, policy_drives = imported.assign(settings.frames)
         imported.check()
     else:
-        drives = _record(settings, root, processes, progress)
+        drives = record(settings, root, processes, progress)
         split = settings.recording.encoder_episodes
         encoder_drives, policy_drives = drives[:split], drives[split:]
     build_frames(
@@ -76,34 +89,43 @@ def prepare(
     return folder
 
 
-def _record(settings: StudySettings, root: Path, processes: int, progress: Progress) -> list[Path]:
-    from study.sim.record import record_all  # noqa: PLC0415
+def record(settings: StudySettings, root: Path, processes: int, progress: Progress) -> list[Path]:
+    """The drives of our town, after recording those that are missing; the simulator is loaded for these only.
 
-    recording = settings.recording
+    Raises BadInputError when the settings cannot be met, or when drives are missing where there is no simulator.
+    """
+    recording, folder = settings.recording, drives_folder(settings, root)
     first, second = recording.seed, recording.seed + POLICY_SEED
     seeds = [
         *range(first, first + recording.encoder_episodes),
         *range(second, second + recording.policy_episodes),
     ]
+    paths = [folder / drive_name(seed) for seed in seeds]
+    missing = sum(not path.exists() for path in paths)
+    if not missing:
+        progress("record", len(paths), len(paths))
+        return paths
+    try:
+        from study.sim.record import record_all  # noqa: PLC0415
+    except ModuleNotFoundError as error:
+        raise BadInputError(
+            f"{missing} of {len(paths)} drives are missing in {folder}, and {error.name}, which records them, is not "
+            "installed here: run 'python -m study.data record' elsewhere with the same settings, and copy the folder"
+        ) from error
+    _check_room(root, recording_cost(settings).bytes, [folder])
     return record_all(
-        settings.town,
-        recording,
-        seeds,
-        drives_folder(settings, root),
-        processes,
-        lambda done, whole: progress("record", done, whole),
+        settings.town, recording, seeds, folder, processes, lambda done, whole: progress("record", done, whole)
     )
 
 
-def _check_room(settings: StudySettings, root: Path, imported: Imported | None) -> None:
+def _check_room(root: Path, need: int, taken: Sequence[Path]) -> None:
+    """Raise BadInputError when `root` has less room than what is to be made; what lies in `taken` is part of that."""
     try:
         root.mkdir(parents=True, exist_ok=True)
         free = shutil.disk_usage(root).free
     except OSError as error:
         raise BadInputError(f"cannot write to {root}: {error.strerror}; name another working folder") from error
-    folder = frames_folder(settings, root, imported)
-    there = _held(drives_folder(settings, root)) + _held(folder.with_name(f".{folder.name}.building"))
-    need = data_cost(settings, recorded=imported is None).bytes - there  # what a killed build has taken is not free
+    need -= sum(map(_held, taken))  # what a killed command has taken is not free
     if need > free:
         raise BadInputError(
             f"{root} has {size(free)} free and the data needs about {size(need)}: "
@@ -122,18 +144,21 @@ def parser() -> Parser:
     """The command line."""
     made = Parser(
         prog="study.data",
-        usage="python -m study.data {build,card,preview} [--profile P] [--data FOLDER] [--group.setting VALUE ...]\n"
+        usage="python -m study.data {record,build,card,preview} [--profile P] [--data FOLDER] [--group.setting V ...]\n"
         "       python -m study.data import DIR [--out FOLDER]\n"
         "       python -m study.data scenes [--out FOLDER] [--episodes N]",
         description="Make the data of a study, describe it, and show it.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        epilog="build    record the drives and render the frames, whatever of them is missing\n"
+        epilog="record   record the drives alone: they are small, and can be rendered on another machine\n"
+        "build    record the drives and render the frames, whatever of them is missing\n"
         "card     what is in the data: PNG and text beside the frame store\n"
         "preview  pictures of frames, and an animated drive, beside the frame store\n"
         "import   check and adapt the Episodes in DIR, so that 'study.sweep NAME --data FOLDER' can use them\n"
         "scenes   record highway-env's intersection, roundabout and merge as Episodes, to be imported",
     )
-    made.add_argument("action", choices=("build", "card", "preview", "import", "scenes"), help="what to do (below)")
+    made.add_argument(
+        "action", choices=("record", "build", "card", "preview", "import", "scenes"), help="what to do (below)"
+    )
     made.add_argument("folder", nargs="?", metavar="DIR", type=Path, help="import: where the Episodes are")
     made.add_argument(
         "--out", type=Path, metavar="FOLDER", help="import: default data/imported/<DIR's name>; scenes: data/scenes"
@@ -175,6 +200,12 @@ def main(args: Sequence[str]) -> int:
     imported = open_import(options.data) if options.data else None
     from study.display import Display  # noqa: PLC0415
 
+    if options.action == "record":
+        if imported:
+            raise BadInputError(f"record: the drives in {options.data} are recorded already; leave out --data")
+        with Display(f"drives ({options.profile})", {}, {}, recording_cost(settings).seconds) as display:
+            print(record(settings, DATA, options.processes, display.data)[0].parent)
+        return 0
     expected = data_cost(settings, recorded=imported is None)
     with Display(f"data ({options.profile})", {}, {}, expected.seconds) as display:
         folder = prepare(settings, DATA, options.processes, display.data, imported)

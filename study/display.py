@@ -5,15 +5,13 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Mapping
-from typing import Self
-
-from rich.console import Console
-from rich.live import Live
-from rich.progress_bar import ProgressBar
-from rich.table import Table
-from rich.text import Text
+from typing import TYPE_CHECKING, Self
 
 from study.cost import clock
+
+if TYPE_CHECKING:  # plain lines need no rich, and a machine that only trains may lack it
+    from rich.live import Live
+    from rich.table import Table
 
 LINE_EVERY = 15.0  # [s] between two plain lines
 STAGES = {"record": "recording drives", "render": "rendering frames", "encoder": "encoder", "policy": "policies"}
@@ -40,8 +38,7 @@ class Display:
         self._began = self._said = time.monotonic()
         self._resumed: dict[str, float] = {}
         self._data_since: dict[str, tuple[float, int]] = {}  # data stage -> when it began, and what was there then
-        console = Console(file=sys.stderr)
-        self._live = Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
+        self._live = _live()
 
     def __enter__(self) -> Self:
         self.say(f"{self._title}: {self._finished} of {self._total} cells finished" if self._total else self._title)
@@ -103,7 +100,7 @@ class Display:
     def say(self, line: str) -> None:
         """A line that stays."""
         if self._live and self._live.is_started:
-            self._live.console.print(Text(line))
+            self._live.console.print(line, markup=False, highlight=False)
         else:
             print(f"{time.strftime('%H:%M:%S')}  {line}", file=sys.stderr, flush=True)
         self._said = time.monotonic()
@@ -133,6 +130,10 @@ class Display:
             self.say("; ".join(part for part in (running or "waiting", self._summary()) if part))
 
     def _picture(self) -> Table:
+        from rich.progress_bar import ProgressBar  # noqa: PLC0415
+        from rich.table import Table  # noqa: PLC0415
+        from rich.text import Text  # noqa: PLC0415
+
         table = Table.grid(padding=(0, 2))
         for key, state in self._state.items():
             bar = ProgressBar(total=1.0, completed=self._shares[key], width=30)
@@ -143,3 +144,14 @@ class Display:
 
     def _done(self) -> float:
         return sum(self._costs[key] * share for key, share in self._shares.items())
+
+
+def _live() -> Live | None:
+    """The part of a terminal that is drawn anew; None where there is no terminal, or no rich to draw with."""
+    try:
+        from rich.console import Console  # noqa: PLC0415
+        from rich.live import Live  # noqa: PLC0415
+    except ImportError:
+        return None
+    console = Console(file=sys.stderr)
+    return Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None

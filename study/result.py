@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
 import tempfile
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,13 +18,14 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
-from study.config import BadInputError, Cell, Grid, StudySettings
+from study.config import BadInputError, Cell, Grid, StudySettings, cell_key
 
 FORMAT_VERSION = 1
 CURVE_COLUMNS = ("policy_seed", "stage", "split", "epoch", "metric", "value")
 TABLE_COLUMNS = ("sweep", "heads", "fraction", "encoder_seed", *CURVE_COLUMNS)
 NO_SEED = -1  # policy_seed of rows that belong to the encoder
 ARRAYS = ("encoder", "policies", "samples", "predictions")
+FILES = ("curves.parquet", *(f"{part}.safetensors" for part in ARRAYS))  # beside cell.json, which names their digests
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -94,6 +97,7 @@ class CellResult:
             self.curves.to_parquet(draft / "curves.parquet", index=False)
             head = {
                 "format_version": FORMAT_VERSION,
+                "digests": {file.name: _digest(file) for file in sorted(draft.iterdir())},
                 "cell": self.cell.model_dump(mode="json"),
                 "key": self.key,
                 "settings": self.settings,
@@ -112,6 +116,9 @@ class CellResult:
             head = json.loads((folder / "cell.json").read_text(encoding="utf-8"))
             if head["format_version"] != FORMAT_VERSION:
                 raise BadInputError(f"{folder}: format {head['format_version']}; this program reads {FORMAT_VERSION}")
+            for name, digest in head.get("digests", {}).items():  # results from before there were any have none
+                if name not in FILES or _digest(folder / name) != digest:
+                    raise ValueError(f"{name} does not match its digest")  # noqa: TRY301 - one report for all damage
             return CellResult(
                 cell=Cell.model_validate(head["cell"]),
                 key=str(head["key"]),
@@ -122,6 +129,58 @@ class CellResult:
             )
         except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
             raise BadInputError(f"{folder} is no whole cell result: {error}; run the cell again") from error
+
+
+def _digest(file: Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()
+
+
+def load_results(folder: Path) -> Iterator[CellResult]:
+    """The results below `folder`, each in a folder named by its key, one after the other, checked.
+
+    Raises BadInputError when there are none, and for one that is not whole or not what its own settings make.
+    """
+    if not folder.is_dir():
+        raise BadInputError(f"{folder} is no folder; name the one that 'python -m study.train' wrote with --out")
+    found = sorted(path.parent for path in folder.glob("*/cell.json"))
+    if not found:
+        raise BadInputError(f"{folder} holds no cell results; name the folder that 'python -m study.train' wrote")
+    for path in found:
+        result = CellResult.load(path)
+        if result.key != path.name:
+            raise BadInputError(f"{path} holds the result of cell {result.key}; give the folder its own name again")
+        try:
+            _check(result)
+        except (ValueError, KeyError, TypeError) as error:
+            raise BadInputError(f"{path} is no result of its own settings ({error}); run the cell again") from error
+        yield result
+
+
+def _check(result: CellResult) -> None:
+    """Raise ValueError, KeyError or TypeError where a result does not fit its own settings."""
+    own = dict(result.settings)
+    seeds, frames = own.pop("policy_seeds"), own.pop("frames_key")
+    settings = StudySettings.model_validate(own)
+    if cell_key(settings, result.cell, seeds, frames) != result.key:
+        raise ValueError("its settings have another key")
+    if set(result.curves.columns) != set(CURVE_COLUMNS):
+        raise ValueError(f"its curves have columns {', '.join(map(str, result.curves.columns))}")
+    if not np.isfinite(result.curves["value"].to_numpy(np.float64)).all():
+        raise ValueError("its curves hold values that are not finite")
+    for stage, wanted, epochs in (
+        ("encoder", [NO_SEED], settings.encoder.epochs),
+        ("policy", list(range(seeds)), settings.policy.epochs),
+    ):
+        rows = result.curves[result.curves["stage"] == stage]
+        if sorted(rows["policy_seed"].unique()) != wanted:
+            raise ValueError(f"its {stage} curves are not those of {len(wanted)} seeds")
+        for names, points in rows.groupby(["split", "metric", "policy_seed"]):
+            if sorted(points["epoch"]) != list(range(1, epochs + 1)):
+                raise ValueError(f"its {stage} curve {names} has not {epochs} epochs, each once")
+    for name in ("acceleration", "steering"):
+        labels, guesses = result.predictions[f"{name}_label"], result.predictions[name]
+        if guesses.shape != (seeds, *labels.shape):
+            raise ValueError(f"its predictions of {name} are {guesses.shape} for {labels.shape} labels")
 
 
 @dataclass(frozen=True)

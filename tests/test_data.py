@@ -50,6 +50,13 @@ def test_progress_reaches_the_end(settings, tmp_path):
     assert [stage for stage, done, whole in told if done == whole] == ["record", "render"]
 
 
+def test_drives_that_are_there_need_no_simulator(settings, root, tmp_path, monkeypatch):
+    shutil.copytree(root / "episodes", tmp_path / "episodes")
+    monkeypatch.setitem(sys.modules, "study.sim.record", None)
+    again = open_frames(prepare(settings, tmp_path, 1, lambda *_: None))
+    assert again.manifest == open_frames(frames_folder(settings, root)).manifest
+
+
 def test_a_damaged_store_is_told(settings, root, tmp_path):
     shutil.copytree(root, tmp_path / "data")
     images = frames_folder(settings, tmp_path / "data") / "encoder" / "images.npy"

@@ -18,7 +18,7 @@ LAYERS = [
     {"data"},
     {"plan"},
     {"report", "worker"},
-    {"sweep"},
+    {"sweep", "train"},
 ]
 OWNERS = {
     "pydantic": {"config", "command"},

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from study.command import obey_parent
-from study.config import FORMAT_VERSIONS, BadInputError, RecordingSettings, TownSettings
+from study.config import FORMAT_VERSIONS, BadInputError, RecordingSettings, TownSettings, drive_name
 from study.episode import Agent, Episode, Lane, Light, empty_states, write_episode
 from study.sim.autopilot import DT, STEERING_UNIT
 from study.sim.env import TownEnv, Traffic
@@ -53,7 +53,7 @@ def record_episode(town: TownSettings, recording: RecordingSettings, seed: int) 
         "steering_unit": STEERING_UNIT,
         "traffic": recorder.facts(cycle),
     }
-    return recorder.episode(f"{seed:08d}", source)
+    return recorder.episode(drive_name(seed), source)
 
 
 class Recorder:
@@ -181,7 +181,7 @@ def record_all(
     if processes < 1:
         raise BadInputError(f"processes: got {processes}; at least 1 is needed")
     folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / f"{seed:08d}" for seed in seeds]
+    paths = [folder / drive_name(seed) for seed in seeds]
     _sweep(folder)
     missing = [(seed, path) for seed, path in zip(seeds, paths, strict=True) if not path.exists()]
     done = len(paths) - len(missing)
