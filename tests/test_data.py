@@ -1,6 +1,7 @@
 """The data stage: from nothing to a frame store, once."""
 
 import shutil
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
