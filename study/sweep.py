@@ -16,13 +16,16 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from study.command import Parser, run
 from study.config import DEFAULT_TRACKING, HEADS, BadInputError, parameter_counts
 from study.cost import Cost, cell_cost, clock, size, total
 from study.data import DATA, drives_folder, prepare
 from study.plan import Plan, add_plan_options, given_plan
+
+if TYPE_CHECKING:
+    from study.tracking import Tracker
 
 EXIT_FAILED, EXIT_INTERRUPTED = 1, 130
 
@@ -46,6 +49,9 @@ def parser() -> Parser:
     made.add_argument("--workers", type=int, default=1, metavar="N", help="cells trained at a time (default: 1)")
     made.add_argument("--device", default="auto", help="cpu, cuda, cuda:1, ... (default: cuda where there is one)")
     made.add_argument("--tracking", default=DEFAULT_TRACKING, metavar="URI", help="MLflow store (default: %(default)s)")
+    made.add_argument(
+        "--import-results", type=Path, metavar="DIR", help="train nothing: commit what study.train has left in DIR"
+    )
     made.add_argument("--no-report", action="store_true", help="stop when the cells are finished")
     return made
 
@@ -67,7 +73,7 @@ def main(args: Sequence[str]) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # a batch system's stop ends as cleanly as Ctrl-C
     with only_sweep(Path("mlruns") / "sweep.lock"):
         try:
-            return execute(plan, options)
+            return import_results(plan, options) if options.import_results else execute(plan, options)
         except KeyboardInterrupt:
             print("\nStopped. Nothing that was finished is lost; the same command goes on.", file=sys.stderr)
             return EXIT_INTERRUPTED
@@ -207,12 +213,34 @@ def execute(plan: Plan, options: argparse.Namespace) -> int:
             tracker.close_sweep(sweep_run, status)
         if not options.no_report:
             display.say("writing the report")
-            from study.report import publish  # noqa: PLC0415
-
-            display.say(f"report: {publish(tracker, plan.grid.name, plan.profile, Path('reports'))}")
+            display.say(f"report: {_publish(plan, tracker)}")
     for key, reason in failed.items():
         print(f"failed: {plan.cells[key].label} ({key}): {reason.strip()}", file=sys.stderr)
     return EXIT_FAILED if failed else 0
+
+
+def import_results(plan: Plan, options: argparse.Namespace) -> int:
+    """Commit what was trained elsewhere; then write the report, or say which cells are missing."""
+    from study.intake import planned_results, take_in  # noqa: PLC0415 - as above
+
+    keys = planned_results(plan, options.import_results)
+    from study.tracking import Tracker  # noqa: PLC0415
+
+    tracker = Tracker(options.tracking)
+    missing = take_in(plan, options.import_results, keys, tracker)
+    for key in missing:
+        print(f"missing: {plan.cells[key].label} ({key})", file=sys.stderr)
+    if missing:
+        print("Import them, too, or train them here: the same command without --import-results.", file=sys.stderr)
+    elif not options.no_report:
+        print(f"report: {_publish(plan, tracker)}", file=sys.stderr)
+    return 0
+
+
+def _publish(plan: Plan, tracker: Tracker) -> Path:
+    from study.report import publish  # noqa: PLC0415
+
+    return publish(tracker, plan.grid.name, plan.profile, Path("reports"))
 
 
 if __name__ == "__main__":

@@ -32,7 +32,6 @@ if TYPE_CHECKING:  # --help and errors in the settings come without these
     from study.result import CellJob
 
 EXIT_FAILED, EXIT_AGAIN, EXIT_INTERRUPTED = 1, 75, 130
-MANIFEST = "manifest.json"  # the frame store's, beside the results
 
 
 def parser() -> Parser:
@@ -93,14 +92,14 @@ def train(plan: Plan, out: Path, device: str) -> int:
     }
     costs = {key: cell_cost(plan.settings, job.cell, job.policy_seeds).seconds for key, job in jobs.items()}
     labels = {key: cell.label for key, cell in plan.cells.items()}
-    ready = (plan.frames / MANIFEST).is_file()
+    ready = (plan.frames / "manifest.json").is_file()
     failed = {}
     with Display(
         f"{plan.grid.name} ({plan.profile})", costs, labels, 0.0 if ready else plan.data_cost.seconds
     ) as display:
         if jobs:
             prepare(plan.settings, DATA, cores(), display.data, plan.imported)
-            shutil.copyfile(plan.frames / MANIFEST, out / MANIFEST)
+            shutil.copyfile(plan.frames / "manifest.json", out / f"frames-{plan.frames.name}.json")
         for key, job in jobs.items():
             with _taken(out / f".{key}.lock") as mine:
                 if not mine or (out / key).is_dir():

@@ -17,7 +17,7 @@ LAYERS = [
     {"drawings", "card", "preview", "comparison"},
     {"data"},
     {"plan"},
-    {"report", "worker"},
+    {"report", "worker", "intake"},
     {"sweep", "train"},
 ]
 OWNERS = {
