@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import errno
+import fcntl
 import multiprocessing
 import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, NoReturn
 
 import yaml
@@ -19,6 +23,11 @@ from pydantic.fields import FieldInfo
 from study.config import BadInputError, Grid, StudySettings
 
 EXIT_BAD_INPUT = 2
+# A disk that is full, a folder that cannot be: the user can change that, anything else is a fault.
+WRITE_ERRORS = (
+    *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG),
+    *(errno.EACCES, errno.EROFS, errno.ENOTDIR, errno.EEXIST),
+)
 GRID_OPTIONS = ("heads", "fractions", "encoder_seeds", "policy_seeds", "baseline")
 
 
@@ -106,6 +115,14 @@ def run(main: Callable[[Sequence[str]], int]) -> NoReturn:
     sys.exit(code)
 
 
+def cannot_write(path: Path, error: OSError) -> str:
+    """What to tell a user of one of the WRITE_ERRORS."""
+    return (
+        f"cannot write {path}: {error.strerror}; make room or name another folder, then give the same command again: "
+        "it goes on where it was"
+    )
+
+
 def obey_parent() -> None:
     """In a child process: leave Ctrl-C to the parent, and end when the parent has been killed.
 
@@ -120,3 +137,27 @@ def obey_parent() -> None:
             os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
+
+
+@contextmanager
+def deaf_to_interrupts() -> Iterator[None]:
+    """Start child processes in here: Ctrl-C reaches every process of a terminal, and is the parent's to answer.
+
+    What is born here stays deaf from its first moment; in this process a Ctrl-C waits for the end of the block.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def alone(lock: Path) -> Iterator[None]:
+    """Hold a lock file, after whoever holds it now; a process that dies lets go of it.
+
+    The file stays: were it removed, two processes could hold two files of that name.
+    """
+    with lock.open("w") as stream:
+        fcntl.flock(stream, fcntl.LOCK_EX)
+        yield

@@ -54,16 +54,20 @@ def prepare(
     """The frame store's folder, after recording and rendering whatever is missing.
 
     `progress(stage, done, total)` with stage "record" (drives) or "render" (frames).
-    Raises BadInputError when the settings cannot be met, the disk is too small, an imported drive has changed or the
-    store there is damaged.
+    A store that was damaged is made again from its drives, and is what it was. Raises BadInputError when the settings
+    cannot be met, the disk is too small or an imported drive has changed.
     """
     folder = frames_folder(settings, root, imported)
     # Imported here: planning needs no arrays, and frames that exist can be studied on a machine without the simulator.
-    from study.frames import build_frames, open_frames  # noqa: PLC0415
+    from study.frames import DamagedFramesError, build_frames, open_frames  # noqa: PLC0415
 
     if (folder / "manifest.json").is_file():
-        open_frames(folder, check=True)  # a store that was damaged since is told now, not by every cell
-        return folder
+        try:
+            open_frames(folder, check=True)
+        except DamagedFramesError as error:
+            print(f"damaged frames: {error}", file=sys.stderr)
+        else:
+            return folder
     _check_room(
         root,
         data_cost(settings, recorded=imported is None).bytes,

@@ -16,17 +16,12 @@ journalled, so a build that was killed goes on, and ends with the same bytes wha
 from __future__ import annotations
 
 import contextlib
-import errno
-import fcntl
 import hashlib
 import io
 import json
-import multiprocessing
-import multiprocessing.process
 import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -36,7 +31,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from study.birdview import MASK_BYTES, Renderer
-from study.command import obey_parent
+from study.command import WRITE_ERRORS, alone, cannot_write
 from study.config import (
     FORMAT_VERSIONS,
     IMAGE,
@@ -47,12 +42,11 @@ from study.config import (
 )
 from study.cost import size
 from study.episode import episode_digest, file_digest, read_episode
+from study.pool import Pool
 from study.selection import LABELS, SETS, Columns, Indices, candidates, choose, histograms
 
 SCHEMA_VERSION = 1
 SHAPES = {"images": (IMAGE, IMAGE, 3), "masks": (2, MASK_BYTES)}
-# A disk that is full, a folder that cannot be: the user can change that, anything else is a fault.
-WRITE_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS, errno.ENOTDIR, errno.EEXIST)
 CHUNK = 512  # frames painted before they are written: 7 MB
 
 # What a random generator is for; with a seed it makes the generator. `selection` has others.
@@ -60,6 +54,10 @@ _SUBSET, _ORDER = 2, 3
 
 Progress = Callable[[str, int, int], None]
 Bytes = NDArray[np.uint8]
+
+
+class DamagedFramesError(BadInputError):
+    """A store that is not whole: made again from its drives, it is what it was."""
 
 
 # --- reading --------------------------------------------------------------------------------------------------------
@@ -128,7 +126,8 @@ def epoch_order(indices: Indices, seed: int, epoch: int) -> Indices:
 def open_frames(folder: Path, *, check: bool = False) -> FrameStore:
     """Open the store in `folder`; with `check`, compare every byte of the arrays with the manifest's digests.
 
-    Raises BadInputError when the folder holds no whole store, or arrays that are not its manifest's.
+    Raises BadInputError when the folder holds no store of this format, and DamagedFramesError, which is one, when it
+    holds less than a manifest says, or something else.
     """
     path = folder / "manifest.json"
     try:
@@ -137,38 +136,40 @@ def open_frames(folder: Path, *, check: bool = False) -> FrameStore:
     except OSError as error:
         raise BadInputError(f"cannot read {path}: {error.strerror}; is {folder} a frame store?") from error
     except (ValueError, KeyError, TypeError) as error:
-        raise BadInputError(f"{path} is no manifest of a frame store ({error!r}): truncated or foreign") from error
+        raise DamagedFramesError(f"{path} is no manifest of a frame store ({error!r}): truncated or foreign") from error
     if version != SCHEMA_VERSION:
         raise BadInputError(f"{path}: schema_version is {version!r}; this program reads {SCHEMA_VERSION}")
     try:
         sets = {name: _open_set(folder / name, manifest["sets"][name], check=check) for name in SETS}
         return FrameStore(**sets, manifest=manifest, key=str(manifest["key"]))
     except (KeyError, TypeError, AttributeError) as error:
-        raise BadInputError(f"{path} lacks what a manifest holds ({error!r}): truncated or foreign") from error
+        raise DamagedFramesError(f"{path} lacks what a manifest holds ({error!r}): truncated or foreign") from error
 
 
 def _open_set(folder: Path, entry: dict[str, Any], *, check: bool) -> Frames:
-    remedy = "delete the store's folder and build it again"
+    remedy = "study.sweep and study.data build make it anew"
     arrays = {}
     for name, shape in SHAPES.items():
         path = folder / f"{name}.npy"
         try:
             array = np.load(path, mmap_mode="r", allow_pickle=False)
         except (OSError, ValueError, EOFError) as error:
-            raise BadInputError(f"{path} is no whole array ({error}); {remedy}") from error
+            raise DamagedFramesError(f"{path} is no whole array ({error}); {remedy}") from error
         expected = (entry["frames"], *shape)
         if array.shape != expected or array.dtype != np.uint8:
-            raise BadInputError(f"{path} is {array.shape} {array.dtype}, the manifest says {expected} uint8; {remedy}")
+            raise DamagedFramesError(
+                f"{path} is {array.shape} {array.dtype}, the manifest says {expected} uint8; {remedy}"
+            )
         arrays[name] = array
     path = folder / "labels.parquet"
     try:
         if file_digest(path) != entry["labels"]:
-            raise BadInputError(f"{path} does not match its digest in the manifest; {remedy}")
+            raise DamagedFramesError(f"{path} does not match its digest in the manifest; {remedy}")
         labels = pd.read_parquet(path)
     except (OSError, ValueError) as error:
-        raise BadInputError(f"{path} holds no labels ({error}); {remedy}") from error
+        raise DamagedFramesError(f"{path} holds no labels ({error}); {remedy}") from error
     if len(labels) != entry["frames"] or list(labels.columns) != list(LABELS):
-        raise BadInputError(f"{path} has {len(labels)} rows of {', '.join(labels.columns)}; {remedy}")
+        raise DamagedFramesError(f"{path} has {len(labels)} rows of {', '.join(labels.columns)}; {remedy}")
     for part in entry["parts"] if check else ():
         rows = slice(part["start"], part["start"] + part["rows"])
         for name, array in arrays.items():
@@ -177,7 +178,7 @@ def _open_set(folder: Path, entry: dict[str, Any], *, check: bool) -> Frames:
                 folder / f"{name}.npy", np.uint8, part["rows"] * each, offset=array.offset + part["start"] * each
             )
             if hashlib.sha256(content.data).hexdigest() != part[name]:
-                raise BadInputError(
+                raise DamagedFramesError(
                     f"{folder / name}.npy, rows {rows.start} to {rows.stop - 1}, does not match its digest in the "
                     f"manifest: changed on disk; {remedy}"
                 )
@@ -198,7 +199,7 @@ def build_frames(
     *,
     key: str | None = None,
 ) -> None:
-    """Build the frame store `folder` from recorded drives; nothing happens when it is there already.
+    """Build the frame store `folder` from recorded drives; nothing happens when it is there already, and whole.
 
     `key` names the store; by default it follows from the settings and the drives' digests. `progress(stage, done,
     total)` with stage "select" (drives) or "render" (frames). A build that was killed goes on where it was.
@@ -208,21 +209,16 @@ def build_frames(
     sources = {"encoder": _sources(encoder_episodes), "policy": _sources(policy_episodes)}
     _check_sources(sources)
     build = _Build(frames, birdview, {"encoder": encoder_episodes, "policy": policy_episodes}, sources, folder, key)
-    if build.finished():
-        return
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        with build.locked():
+        with alone(folder.parent / ".lock"):
             if not build.finished():
-                with _pool(processes) as pool:
+                with Pool(processes) as pool:
                     build.run(pool, progress or (lambda *_: None))
     except OSError as error:
         if error.errno not in WRITE_ERRORS:
             raise
-        raise BadInputError(
-            f"cannot write {folder}: {error.strerror}; make room or name another folder, then give the same command "
-            "again: it goes on where it was"
-        ) from error
+        raise BadInputError(cannot_write(folder, error)) from error
 
 
 def _sources(paths: Sequence[Path]) -> list[dict[str, str]]:
@@ -241,32 +237,6 @@ def _check_sources(sources: dict[str, list[dict[str, str]]]) -> None:
                     f"drive {item['name']} serves the {other} set and again the {name} set; every drive serves once, "
                     "and the policy set needs drives of its own (Sec. V-A)"
                 )
-
-
-@contextlib.contextmanager
-def _pool(processes: int) -> Iterator[ProcessPoolExecutor | None]:
-    if processes < 2:
-        yield None
-        return
-    context = multiprocessing.get_context("spawn")  # a fork would copy the threads' locks of torch and pyarrow
-    pool = ProcessPoolExecutor(processes, mp_context=context, initializer=obey_parent)
-    try:
-        yield pool
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def _results(
-    pool: ProcessPoolExecutor | None, function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]]
-) -> Iterator[tuple[int, Any]]:
-    """Task number and result, as they are finished."""
-    if pool is None:
-        for number, task in enumerate(tasks):
-            yield number, function(*task)
-        return
-    futures: dict[Future[Any], int] = {pool.submit(function, *task): number for number, task in enumerate(tasks)}
-    for future in as_completed(futures):
-        yield futures.pop(future), future.result()
 
 
 @dataclass(frozen=True)
@@ -292,25 +262,25 @@ class _Build:
         return self.folder.with_name(f".{self.folder.name}.building")
 
     def finished(self) -> bool:
-        """Whether the folder holds the store of these inputs. Raises BadInputError when it holds something else."""
+        """Whether the folder holds the store of these inputs; a damaged one becomes a draft, to be cleared away.
+
+        Raises BadInputError when it holds something else.
+        """
         if not self.folder.exists():
             return False
-        if open_frames(self.folder).manifest["inputs"] != self.inputs:
+        try:
+            inputs = open_frames(self.folder, check=True).manifest["inputs"]
+        except DamagedFramesError:
+            shutil.rmtree(self.draft, ignore_errors=True)
+            self.folder.rename(self.draft)
+            return False
+        if inputs != self.inputs:
             raise BadInputError(
                 f"{self.folder} holds frames of other settings or drives; delete it or name another folder"
             )
         return True
 
-    @contextlib.contextmanager
-    def locked(self) -> Iterator[None]:
-        """Wait for another process that builds the same folder."""
-        path = self.folder.with_name(f".{self.folder.name}.lock")
-        with path.open("w") as stream:
-            fcntl.flock(stream, fcntl.LOCK_EX)
-            yield
-            path.unlink(missing_ok=True)
-
-    def run(self, pool: ProcessPoolExecutor | None, progress: Progress) -> None:
+    def run(self, pool: Pool, progress: Progress) -> None:
         plan = self._plan(pool, progress)
         self._allocate(plan)
         parts = self._render(pool, plan, progress)
@@ -337,11 +307,11 @@ class _Build:
             },
         }
         _write_json(self.draft / "manifest.json", manifest)
-        self.draft.rename(self.folder)
         for left in ("plan.json", "journal"):
-            (self.folder / left).unlink()
+            (self.draft / left).unlink()
+        self.draft.rename(self.folder)
 
-    def _plan(self, pool: ProcessPoolExecutor | None, progress: Progress) -> dict[str, Any]:
+    def _plan(self, pool: Pool, progress: Progress) -> dict[str, Any]:
         """Choose the frames, or take up the choice of a build that was killed. The draft holds the labels then."""
         path = self.draft / "plan.json"
         if path.is_file():
@@ -360,7 +330,7 @@ class _Build:
             for number, path in enumerate(self.paths[name])
         ]
         tables: list[Columns] = [{}] * len(tasks)
-        for done, (number, table) in enumerate(_results(pool, candidates, tasks)):
+        for done, (number, table) in enumerate(pool.results(candidates, tasks)):
             tables[number] = table
             progress("select", done + 1, len(tasks))
         plan = {"inputs": self.inputs}
@@ -411,9 +381,7 @@ class _Build:
                 with path.open("r+b") as stream:
                     os.posix_fallocate(stream.fileno(), 0, length)
 
-    def _render(
-        self, pool: ProcessPoolExecutor | None, plan: dict[str, Any], progress: Progress
-    ) -> dict[str, list[dict[str, Any]]]:
+    def _render(self, pool: Pool, plan: dict[str, Any], progress: Progress) -> dict[str, list[dict[str, Any]]]:
         parts: dict[str, dict[int, dict[str, Any]]] = {name: {} for name in SETS}
         for line in _journal(self.draft / "journal"):
             parts[line["set"]][line["start"]] = line["part"]
@@ -431,7 +399,7 @@ class _Build:
         done = sum(part["rows"] for name in SETS for part in parts[name].values())
         progress("render", done, total)
         with (self.draft / "journal").open("a") as journal:
-            for number, part in _results(pool, _render_part, tasks):
+            for number, part in pool.results(_render_part, tasks):
                 name = tasks[number][3].name
                 parts[name][part["start"]] = part
                 journal.write(json.dumps({"set": name, "start": part["start"], "part": part}) + "\n")

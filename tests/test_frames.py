@@ -74,7 +74,7 @@ def test_processes_do_not_change_the_store(built, drives, tmp_path):
     build_frames(FRAMES, VIEW, *drives, tmp_path / "two", 2)
     for file in sorted(path.relative_to(built) for path in built.rglob("*") if path.is_file()):
         assert (tmp_path / "two" / file).read_bytes() == (built / file).read_bytes(), file
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["two"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".lock", "two"]
 
 
 def test_a_second_build_does_nothing(built, drives):

@@ -8,6 +8,7 @@ ROOT = Path(__file__).parent.parent
 LAYERS = [
     {"config"},
     {"episode", "result", "cost", "command", "provenance"},
+    {"pool"},
     {"birdview", "sim"},
     {"selection", "adapt"},
     {"frames", "imported"},

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import math
-import multiprocessing
 import shutil
-import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from study.command import obey_parent
+from study.command import WRITE_ERRORS, alone, cannot_write
 from study.config import FORMAT_VERSIONS, BadInputError, RecordingSettings, TownSettings, drive_name
 from study.episode import Agent, Episode, Lane, Light, empty_states, write_episode
+from study.pool import Pool
 from study.sim.autopilot import DT, STEERING_UNIT
 from study.sim.env import TownEnv, Traffic
 from study.sim.town import LANE_WIDTH, LENGTH, WIDTH, Floats, Town
@@ -23,7 +21,6 @@ from study.sim.town import LANE_WIDTH, LENGTH, WIDTH, Floats, Town
 FORMAT_VERSION = FORMAT_VERSIONS["episodes"]  # raised when the same settings and seed give another drive
 BEYOND = 60.0  # of the planned route that is recorded behind the last position [m]
 STANDING = 0.1  # [m/s]
-STALE = 60.0  # a draft this old belongs to a call that was killed; writing takes a fraction of a second [s]
 
 
 def record_episode(town: TownSettings, recording: RecordingSettings, seed: int) -> Episode:
@@ -180,49 +177,25 @@ def record_all(
     """
     if processes < 1:
         raise BadInputError(f"processes: got {processes}; at least 1 is needed")
-    folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / drive_name(seed) for seed in seeds]
-    _sweep(folder)
-    missing = [(seed, path) for seed, path in zip(seeds, paths, strict=True) if not path.exists()]
-    done = len(paths) - len(missing)
-
-    def report() -> None:
-        if progress is not None:
-            progress(done, len(paths))
-
-    report()
-    jobs = [(town, recording, seed, path) for seed, path in missing]
-    if processes == 1 or len(jobs) < 2:
-        for job in jobs:
-            _record(*job)
-            done += 1
-            report()
-        return paths
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(processes, len(jobs)), mp_context=context, initializer=obey_parent) as pool:
-        futures = [pool.submit(_record, *job) for job in jobs]
-        try:
-            for future in as_completed(futures):
-                future.result()
-                done += 1
-                report()
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with alone(folder / ".lock"):
+            for left in folder.glob(".*/"):  # drafts of calls that were killed
+                shutil.rmtree(left)
+            jobs = [(town, recording, seed, path) for seed, path in zip(seeds, paths, strict=True) if not path.exists()]
+            done = len(paths) - len(jobs)
+            report = progress or (lambda *_: None)
+            report(done, len(paths))
+            with Pool(min(processes, len(jobs))) as pool:
+                for number, _ in enumerate(pool.results(_record, jobs), done + 1):
+                    report(number, len(paths))
+    except OSError as error:
+        if error.errno not in WRITE_ERRORS:
             raise
+        raise BadInputError(cannot_write(folder, error)) from error
     return paths
 
 
 def _record(town: TownSettings, recording: RecordingSettings, seed: int, path: Path) -> None:
-    episode = record_episode(town, recording, seed)
-    try:
-        write_episode(episode, path)
-    except OSError:
-        if not path.exists():  # else another call on the same folder was faster, with the same bytes
-            raise
-
-
-def _sweep(folder: Path) -> None:
-    """Remove the drafts of calls that were killed."""
-    for draft in folder.glob(".*"):
-        if draft.is_dir() and time.time() - draft.stat().st_mtime > STALE:
-            shutil.rmtree(draft, ignore_errors=True)
+    write_episode(record_episode(town, recording, seed), path)
