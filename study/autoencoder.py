@@ -10,12 +10,14 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import hashlib
+import io
 import itertools
 import logging
 import math
 import os
 import pickle
 import signal
+import sys
 import tempfile
 import threading
 import time
@@ -60,6 +62,8 @@ Progress = Callable[[int, int], None]
 MASKS = ("pred", "plan")  # order of the store's masks
 SAMPLES = 16
 CHECKPOINT_SECONDS = 60.0  # between two checkpoints of 23 MB: what a kill costs at most
+DIGEST = hashlib.sha256().digest_size  # bytes, before what torch writes
+ZIP = b"PK"  # how a checkpoint from before there were digests begins
 PROGRESS_SECONDS = 0.25
 RESIDENT_SHARE = 0.6  # of a GPU's free memory that the data may fill; the rest is for activations
 _CORE_NUMBERS = CHANNELS[-1] * CORE * CORE
@@ -450,11 +454,19 @@ class _State:
     rows: list[tuple[str, int, str, float]] = field(default_factory=list)
 
 
+class _DamagedError(Exception):
+    """A checkpoint that was changed or cut off on disk."""
+
+
 def _write_checkpoint(path: Path, content: dict[str, Any]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
+    # In memory first: torch makes errors of its own of a full disk's, and keeps no digest of what it writes.
+    stream = io.BytesIO()
+    torch.save(content, stream)
     with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as draft:
         try:
-            torch.save(content, draft)
+            draft.write(hashlib.sha256(stream.getbuffer()).digest())
+            draft.write(stream.getbuffer())
             draft.flush()
             os.fsync(draft.fileno())
             Path(draft.name).replace(path)
@@ -464,12 +476,17 @@ def _write_checkpoint(path: Path, content: dict[str, Any]) -> None:
 
 
 def _read_checkpoint(path: Path, training: dict[str, Any]) -> dict[str, Any]:
-    """What `_write_checkpoint` wrote. Raises BadInputError when it is broken, or of another training."""
+    """What `_write_checkpoint` wrote. Raises _DamagedError, and BadInputError when it is of another training."""
+    raw = path.read_bytes()
+    if not raw.startswith(ZIP):
+        digest, raw = raw[:DIGEST], raw[DIGEST:]
+        if hashlib.sha256(raw).digest() != digest:
+            raise _DamagedError(f"{path} does not match its digest")
     try:
-        content: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+        content: dict[str, Any] = torch.load(io.BytesIO(raw), map_location="cpu", weights_only=True)
         other = content["training"]
     except (OSError, RuntimeError, EOFError, KeyError, TypeError, ValueError, pickle.UnpicklingError) as error:
-        raise BadInputError(f"{path} is no checkpoint of an encoder ({error}); delete it to train anew") from error
+        raise _DamagedError(f"{path} is no checkpoint of an encoder ({error})") from error
     for name in sorted(training | other):
         if training.get(name) != other.get(name):
             raise BadInputError(
@@ -516,7 +533,8 @@ def train_encoder(
 
     `log(epoch, losses)` is called after each epoch, counted from 1, with losses such as "test/loss_rec"; after a resume
     first for the epochs that were done before. `progress(steps done, steps in all)` comes a few times a second.
-    `checkpoint` is the file that a killed training goes on from; it stays when the training is done.
+    `checkpoint` is the file that a killed training goes on from; it stays when the training is done. One that was
+    damaged on disk is told and not used.
     Raises BadInputError for a head set, device, batch or checkpoint that cannot be used, and TrainingDivergedError,
     naming epoch and step, for a loss that is not finite.
     """
@@ -605,7 +623,11 @@ class _Course(lightning.Callback):
         """Take up the checkpoint, when there is one."""
         if self.checkpoint is None or not self.checkpoint.exists():
             return
-        content = _read_checkpoint(self.checkpoint, self.training)
+        try:
+            content = _read_checkpoint(self.checkpoint, self.training)
+        except _DamagedError as error:
+            print(f"damaged checkpoint: {error}; the encoder is trained anew", file=sys.stderr)
+            return
         self.module.load_state_dict(content["network"])
         self.module.sums["train"] = content["sums"]
         self.module.noise_state = content["noise"]

@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 from safetensors import SafetensorError
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import load_file, save
 
 from study.config import BadInputError, Cell, Grid, StudySettings, cell_key
 
@@ -93,7 +93,8 @@ class CellResult:
             draft.mkdir()
             for part in ARRAYS:
                 arrays = {key: np.ascontiguousarray(value) for key, value in getattr(self, part).items()}
-                save_file(arrays, draft / f"{part}.safetensors")
+                # Not `save_file`, whose error of a full disk is no OSError.
+                (draft / f"{part}.safetensors").write_bytes(save(arrays))
             self.curves.to_parquet(draft / "curves.parquet", index=False)
             head = {
                 "format_version": FORMAT_VERSION,
