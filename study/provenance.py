@@ -9,6 +9,7 @@ import hashlib
 import importlib.metadata
 import os
 import platform
+import re
 import shutil
 import subprocess
 import tempfile
@@ -23,14 +24,14 @@ NEW_FILES = ("study", "sweeps", "tests", "benchmarks")  # elsewhere a new file m
 def provenance(root: Path = ROOT) -> dict[str, Any]:
     """What made a result: `commit`, `dirty`, `diff`, `lock`, `packages`, `python`, `platform`, `cpu`, `cores`.
 
-    Outside a git checkout `commit` is None, `dirty` False and `diff` empty; `lock` is the sha256 of requirements.lock
-    or None. A diff beyond 1 MB is cut, and says so in its last line.
+    Outside a git checkout `commit` is what `git archive` wrote down or None, `dirty` False and `diff` empty; `lock` is
+    the sha256 of requirements.lock or None. A diff beyond 1 MB is cut, and says so in its last line.
     """
-    commit = _git(root, "rev-parse", "HEAD").strip()
-    diff = _diff(root) if commit else ""
+    head = _head(root)
+    diff = _diff(root) if head else ""
     lock = root / "requirements.lock"
     return {
-        "commit": commit or None,
+        "commit": head or _archived(root),
         "dirty": bool(diff),
         "diff": diff,
         "lock": hashlib.sha256(lock.read_bytes()).hexdigest() if lock.is_file() else None,
@@ -51,6 +52,19 @@ def packages() -> dict[str, str]:
     """Name -> version of every installed distribution."""
     found = ((dist.name, dist.version) for dist in importlib.metadata.distributions())
     return dict(sorted((name.lower().replace("_", "-"), version) for name, version in found if name))
+
+
+def _head(root: Path) -> str:
+    """The commit of the checkout whose top is `root`; empty where there is none, or only one that lies around it."""
+    below, _, commit = _git(root, "rev-parse", "--show-prefix", "HEAD").partition("\n")
+    return "" if below else commit.strip()
+
+
+def _archived(root: Path) -> str | None:
+    """The commit that `git archive` wrote into its copy of the code."""
+    path = root / ".git_archival.txt"
+    found = re.match("node: ([0-9a-f]{40})$", path.read_text(encoding="utf-8").strip()) if path.is_file() else None
+    return found[1] if found else None
 
 
 def _git(root: Path, *words: str, index: Path | None = None) -> str:

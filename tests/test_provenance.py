@@ -4,11 +4,12 @@ import getpass
 import json
 import os
 import platform
+import shutil
 import subprocess
 
 import pytest
 
-from study.provenance import DIFF_LIMIT, cores, provenance
+from study.provenance import DIFF_LIMIT, ROOT, cores, provenance
 
 
 def git(folder, *words):
@@ -63,6 +64,23 @@ def test_outside_a_checkout_the_rest_is_known(tmp_path):
     assert (found["commit"], found["lock"], found["diff"]) == (None, None, "")
     assert found["packages"]["numpy"]
     assert found["cores"] >= 1
+
+
+def test_a_copy_made_by_git_archive_knows_its_commit(checkout, tmp_path_factory):
+    for name in (".git_archival.txt", ".gitattributes"):
+        shutil.copy(ROOT / name, checkout)
+    git(checkout, "add", ".")
+    git(checkout, "commit", "-qm", "second")
+    copy = tmp_path_factory.mktemp("copy")
+    git(checkout, "archive", "--output", str(copy / "code.tar"), "HEAD")
+    shutil.unpack_archive(copy / "code.tar", copy)
+    assert provenance(copy)["commit"] == provenance(checkout)["commit"]
+
+
+def test_a_checkout_around_the_code_is_not_its_own(checkout):
+    (checkout / "study" / "a.py").write_text("A = 2\n")
+    found = provenance(checkout / "study")
+    assert (found["commit"], found["dirty"]) == (None, False)
 
 
 def test_no_user_or_host_name_is_told(checkout):

@@ -2,7 +2,6 @@
 
 import fcntl
 import os
-import shutil
 import subprocess
 import sys
 import time
@@ -10,22 +9,23 @@ from pathlib import Path
 
 import pytest
 
-from drives import crossing_drive
+import study.cell  # noqa: F401 - torch is loaded now, so that the limit ends a training and not the import
 from study.command import Parser
-from study.config import BadInputError, drive_name
-from study.data import DATA, POLICY_SEED, drives_folder
-from study.episode import write_episode
+from study.config import BadInputError
 from study.plan import add_plan_options, given_plan
 from study.result import load_results
+from study.tracking import Tracker
 from study.train import EXIT_AGAIN, EXIT_FAILED, main
 
 ROOT = Path(__file__).parent.parent
-PLAN = [
-    *("heads", "--profile", "smoke", "--heads", "[rec,full]", "--policy_seeds", "2"),
+SWEEP = ["heads", "--heads", "[rec,full]", "--policy_seeds", "2"]
+SETTINGS = [
+    *("--profile", "smoke", "--town.vehicles", "30", "--recording.warm_up", "1", "--recording.duration", "4"),
     *("--recording.encoder_episodes", "2", "--recording.policy_episodes", "2"),
     *("--frames.encoder", "40", "--frames.policy", "40"),
     *("--encoder.batch", "16", "--encoder.epochs", "1", "--policy.batch", "16", "--policy.epochs", "5"),
 ]
+PLAN = [*SWEEP, *SETTINGS]
 # What the GPU machine lacks is gone for imports and for those who ask what is installed, in child processes, too.
 REFUSAL = """
 import importlib.metadata as metadata, sys
@@ -50,39 +50,53 @@ def plan(words=PLAN):
     return given_plan(parser.parse(words))
 
 
+def script(at, *words, **environment):
+    """A step of benchmarks/paper_scale.sh, from the code in `at`."""
+    done = subprocess.run(
+        ["bash", str(at / "benchmarks" / "paper_scale.sh"), *words],
+        env=os.environ | {"PYTHON": sys.executable, **environment},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stderr
+
+
 @pytest.fixture(scope="module")
 def home(tmp_path_factory):
-    """A working folder with drives that were recorded elsewhere."""
-    made = tmp_path_factory.mktemp("train")
-    shutil.copytree(ROOT / "sweeps", made / "sweeps")
+    """What travels to the GPU machine: the last commit's code, and drives."""
+    made = tmp_path_factory.mktemp("train") / "packed"
+    script(ROOT, "pack", str(made), *SETTINGS, SWEEP=" ".join(SWEEP), WHEELS="")
     before = Path.cwd()
     os.chdir(made)
-    for seed in (0, 1, POLICY_SEED, POLICY_SEED + 1):
-        write_episode(crossing_drive(seed), drives_folder(plan().settings, made / DATA) / drive_name(seed))
     yield made
     os.chdir(before)
 
 
 @pytest.fixture(scope="module")
 def results(home):
-    """Results of a process that has no tracker, no queue and no simulator."""
-    (home / "refusal").mkdir()
-    (home / "refusal" / "sitecustomize.py").write_text(REFUSAL)
-    done = subprocess.run(
-        [sys.executable, "-m", "study.train", *PLAN, "--out", "results"],
-        cwd=home,
-        env=os.environ | {"PYTHONPATH": f"{home / 'refusal'}:{ROOT}"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
+    """Results of processes that have no tracker, no queue and no simulator."""
+    refusal = home.with_name("refusal")
+    refusal.mkdir()
+    (refusal / "sitecustomize.py").write_text(REFUSAL)
+    script(home, "train", PYTHONPATH=str(refusal))
     return home / "results"
 
 
 @pytest.mark.slow
 def test_cells_are_trained_where_tracker_queue_and_simulator_are_missing(results):
     assert {result.key: result.cell for result in load_results(results)} == plan().cells
+
+
+@pytest.mark.slow
+def test_they_are_imported_to_the_report_where_they_come_back(home, results):
+    said = script(ROOT, "import", str(home))
+    assert said.count("imported") == 2
+    assert (home / "reports/heads.pdf").read_bytes().startswith(b"%PDF")
+    commit = subprocess.run(["git", "-C", str(ROOT), "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
+    record = Tracker().read_sweep("heads")
+    assert {result.facts["provenance"]["commit"] for result in record.results.values()} == {commit.stdout.strip()}
 
 
 def test_a_cell_that_is_there_is_not_trained_again(results):
