@@ -9,7 +9,7 @@ from __future__ import annotations
 import resource
 import time
 from collections.abc import Callable
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -43,6 +43,8 @@ def run_cell(job: CellJob, log: Log, progress: Progress) -> CellResult:
         )
     device = choose_device(job)
     torch.set_num_threads(job.threads)
+    # Now, not at the end: the code that runs is the one that was loaded, whatever is edited meanwhile.
+    origin = provenance() | {"determinism": determinism(), "seeds": _seeds(job)}
 
     started = time.perf_counter()
     encoder = train_encoder(
@@ -116,11 +118,34 @@ def run_cell(job: CellJob, log: Log, progress: Progress) -> CellResult:
             "device": device_name(device),
             "precision": encoder.precision,
             "threads": job.threads,
-            "provenance": provenance(),
+            "provenance": origin,
         },
     )
     result.save(job.result_folder)
     return result
+
+
+def determinism() -> dict[str, Any]:
+    """What torch has been told about speed against equal bits, and what it computes with on a CPU."""
+    cudnn, cuda = torch.backends.cudnn, torch.backends.cuda
+    return {
+        "deterministic_algorithms": torch.are_deterministic_algorithms_enabled(),
+        "cudnn_deterministic": cudnn.deterministic,
+        "cudnn_benchmark": cudnn.benchmark,
+        "cudnn_tf32": cudnn.allow_tf32,
+        "matmul_tf32": cuda.matmul.allow_tf32,
+        "mkldnn": torch.backends.mkldnn.enabled,
+        "cpu_capability": torch.backends.cpu.get_cpu_capability(),
+    }
+
+
+def _seeds(job: CellJob) -> dict[str, Any]:
+    return {
+        "recording": job.settings.recording.seed,
+        "frames": job.settings.frames.seed,
+        "encoder": job.cell.encoder_seed,
+        "policies": list(range(job.policy_seeds)),
+    }
 
 
 def choose_device(job: CellJob) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Self
 
 from study.cost import clock
@@ -19,6 +19,23 @@ UNITS = {"record": "drive", "render": "frame", "encoder": "step", "policy": "epo
 ENCODER_SHARE = 0.8  # of a cell's time, where the two stages are not told apart beforehand
 RECORD_SHARE = 0.8  # of the data's time, likewise
 DATA_KEY = ""
+
+
+def show_table(rows: Sequence[Sequence[str]], styles: Sequence[str]) -> None:
+    """Print rows of columns, each row in its style (rich's names) on a terminal; plain aligned text in a pipe."""
+    if sys.stdout.isatty():
+        from rich.console import Console  # noqa: PLC0415
+        from rich.table import Table  # noqa: PLC0415
+        from rich.text import Text  # noqa: PLC0415
+
+        table = Table.grid(padding=(0, 2))
+        for row, style in zip(rows, styles, strict=True):
+            table.add_row(*map(Text, row), style=style)
+        Console().print(table)
+        return
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        print("  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip())
 
 
 class Display:

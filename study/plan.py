@@ -5,11 +5,12 @@ from __future__ import annotations
 import argparse
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from study.command import GRID_OPTIONS, Parser, add_options, grid_overrides, study_overrides
 from study.config import (
     SWEEPS,
+    BadInputError,
     Cell,
     Grid,
     StudySettings,
@@ -23,6 +24,10 @@ from study.config import (
 from study.cost import Cost, data_cost
 from study.data import DATA, frames_folder
 from study.imported import Imported, open_import
+from study.provenance import usual_threads
+
+if TYPE_CHECKING:
+    from study.tracking import Tracker
 
 
 @dataclass(frozen=True)
@@ -84,6 +89,48 @@ def add_plan_options(parser: Parser) -> None:
     add_options(parser, StudySettings)
 
 
+def add_machine_options(parser: Parser) -> None:
+    """What every command takes that trains cells."""
+    parser.add_argument("--device", default="auto", help="cpu, cuda, cuda:1, ... (default: cuda where there is one)")
+    parser.add_argument(
+        "--threads",
+        type=int,
+        default=usual_threads(),
+        metavar="N",
+        help="threads each cell computes with; with another number the last digits differ (default: %(default)s)",
+    )
+
+
+def check_machine(options: argparse.Namespace) -> None:
+    """Raise BadInputError for a device that is not there, or no threads."""
+    if options.threads < 1:
+        raise BadInputError(f"--threads is {options.threads}; it must be 1 or more")
+    if options.device not in {"auto", "cpu"}:
+        from study.autoencoder import check_device  # noqa: PLC0415 - loads torch, which only a named GPU needs here
+
+        check_device(options.device)
+
+
+def thread_hint(workers: int, threads: int, there: int) -> str:
+    """What to say when there are more threads than cores: they wait for each other, and keep the cores busy with it."""
+    if threads == 1 or workers * threads <= there:
+        return ""
+    return (
+        f"{workers} workers with {threads} threads each hinder each other on {there} cores: give fewer --workers, or "
+        f"--threads {max(1, there // workers)}, whose results differ in their last digits"
+    )
+
+
 def given_plan(options: argparse.Namespace) -> Plan:
     """The plan that those options ask for. Raises BadInputError."""
     return make_plan(options.sweep, options.profile, study_overrides(options), grid_overrides(options), options.data)
+
+
+def look_up(tracking: str) -> Tracker | None:
+    """The tracking store of that URI, or None where nothing was tracked yet. Looking makes nothing."""
+    path = tracking.removeprefix("sqlite:///")
+    if path != tracking and not Path(path).is_file():
+        return None  # and MLflow need not be loaded
+    from study.tracking import Tracker  # noqa: PLC0415
+
+    return Tracker.look(tracking)

@@ -74,9 +74,12 @@ def facts_of(facts: Mapping[str, Any]) -> tuple[dict[str, float], dict[str, str]
     origin = facts.get("provenance", {})
     if origin.get("commit"):
         words[COMMIT] = str(origin["commit"])
-    for name in ("dirty", "python", "platform", "cpu"):
-        if name in origin:
+    for name in ("dirty", "diff_digest", "lock", "python", "platform", "cpu"):
+        if origin.get(name) is not None:
             words[name] = str(origin[name])
+    for name in ("determinism", "seeds"):
+        if name in origin:
+            words[name] = json.dumps(origin[name])
     for name, value in flatten({name: value for name, value in facts.items() if name != "provenance"}).items():
         if isinstance(value, int | float) and not isinstance(value, bool):
             numbers[name.replace(".", "/")] = float(value)

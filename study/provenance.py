@@ -18,6 +18,7 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
 DIFF_LIMIT = 1_000_000  # bytes
+THREADS = 2  # a cell computes with; another number gives other last digits
 NEW_FILES = ("study", "sweeps", "tests", "benchmarks")  # elsewhere a new file may be a secret or a data set
 
 
@@ -25,7 +26,8 @@ def provenance(root: Path = ROOT) -> dict[str, Any]:
     """What made a result: `commit`, `dirty`, `diff`, `lock`, `packages`, `python`, `platform`, `cpu`, `cores`.
 
     Outside a git checkout `commit` is what `git archive` wrote down or None, `dirty` False and `diff` empty; `lock` is
-    the sha256 of requirements.lock or None. A diff beyond 1 MB is cut, and says so in its last line.
+    the sha256 of requirements.lock or None, `diff_digest` that of the diff or None. A diff beyond 1 MB is cut, and says
+    so in its last line.
     """
     head = _head(root)
     diff = _diff(root) if head else ""
@@ -34,6 +36,7 @@ def provenance(root: Path = ROOT) -> dict[str, Any]:
         "commit": head or _archived(root),
         "dirty": bool(diff),
         "diff": diff,
+        "diff_digest": hashlib.sha256(diff.encode()).hexdigest() if diff else None,
         "lock": hashlib.sha256(lock.read_bytes()).hexdigest() if lock.is_file() else None,
         "packages": packages(),
         "python": platform.python_version(),
@@ -46,6 +49,14 @@ def provenance(root: Path = ROOT) -> dict[str, Any]:
 def cores() -> int:
     """How many cores this process may use: a batch system or a container often gives fewer than the machine has."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def usual_threads() -> int:
+    """How many threads a cell computes with when nobody says otherwise.
+
+    A matter of the machine, never of how many cells are trained at a time: the bytes of a result depend on it.
+    """
+    return min(THREADS, cores())
 
 
 def packages() -> dict[str, str]:

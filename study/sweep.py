@@ -22,7 +22,8 @@ from study.command import Parser, run
 from study.config import DEFAULT_TRACKING, HEADS, BadInputError, parameter_counts
 from study.cost import Cost, cell_cost, clock, size, total
 from study.data import DATA, drives_folder, prepare
-from study.plan import Plan, add_plan_options, given_plan
+from study.plan import Plan, add_machine_options, add_plan_options, check_machine, given_plan, look_up, thread_hint
+from study.provenance import cores, provenance
 
 if TYPE_CHECKING:
     from study.tracking import Tracker
@@ -37,7 +38,9 @@ def parser() -> Parser:
     """The command line."""
     made = Parser(
         prog="study.sweep",
-        usage="python -m study.sweep NAME [--profile P] [--dry-run] [--group.setting VALUE ...]",
+        usage="python -m study.sweep NAME [--profile P] [--dry-run] [--group.setting VALUE ...]\n"
+        "       python -m study.sweep status NAME ...    what is done, what runs where, what is left\n"
+        "       python -m study.sweep verify NAME ...    compute a finished cell again and compare",
         description="Run a sweep to its report. Finished cells never run again; a killed sweep goes on.",
         epilog="In brackets: the value where the profile names no other.\n"
         "Example: python -m study.sweep heads --profile smoke --heads '[rec,full]' --encoder.epochs 50",
@@ -47,7 +50,7 @@ def parser() -> Parser:
     made.add_argument("--dry-run", action="store_true", help="show what would run, what is done, and what it costs")
     made.add_argument("--json", action="store_true", help="with --dry-run: one JSON object on stdout")
     made.add_argument("--workers", type=int, default=1, metavar="N", help="cells trained at a time (default: 1)")
-    made.add_argument("--device", default="auto", help="cpu, cuda, cuda:1, ... (default: cuda where there is one)")
+    add_machine_options(made)
     made.add_argument("--tracking", default=DEFAULT_TRACKING, metavar="URI", help="MLflow store (default: %(default)s)")
     made.add_argument(
         "--import-results", type=Path, metavar="DIR", help="train nothing: commit what study.train has left in DIR"
@@ -58,16 +61,21 @@ def parser() -> Parser:
 
 def main(args: Sequence[str]) -> int:
     """Run the command and return its exit code."""
+    if args[:1] == ["status"]:
+        from study.status import main as status  # noqa: PLC0415
+
+        return status(args[1:])
+    if args[:1] == ["verify"]:
+        from study.verify import main as verify  # noqa: PLC0415
+
+        return verify(args[1:])
     options = parser().parse(args)
     plan = given_plan(options)
     if options.json and not options.dry_run:
         raise BadInputError("--json goes with --dry-run; add --dry-run")
     if options.workers < 1:
         raise BadInputError(f"--workers is {options.workers}; it must be 1 or more")
-    if options.device not in {"auto", "cpu"}:
-        from study.autoencoder import check_device  # noqa: PLC0415 - loads torch, which only a named GPU needs here
-
-        check_device(options.device)
+    check_machine(options)
     if options.dry_run:
         return dry_run(plan, options.tracking, as_json=options.json)
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # a batch system's stop ends as cleanly as Ctrl-C
@@ -84,7 +92,8 @@ def main(args: Sequence[str]) -> int:
 
 def dry_run(plan: Plan, tracking: str, *, as_json: bool) -> int:
     """Print the plan, what of it is finished, and what the rest costs."""
-    done = _finished(plan, tracking)
+    tracker = look_up(tracking)
+    done = tracker.finished(list(plan.cells)) if tracker else {}
     costs = [
         cell_cost(plan.settings, cell, plan.grid.policy_seeds) for key, cell in plan.cells.items() if key not in done
     ]
@@ -129,16 +138,6 @@ def dry_run(plan: Plan, tracking: str, *, as_json: bool) -> int:
     return 0
 
 
-def _finished(plan: Plan, tracking: str) -> set[str]:
-    # Looking must not create: a store that does not exist has nothing finished, and MLflow need not be loaded.
-    path = tracking.removeprefix("sqlite:///")
-    if path != tracking and not Path(path).is_file():
-        return set()
-    from study.tracking import Tracker  # noqa: PLC0415
-
-    return set(Tracker(tracking).finished(list(plan.cells)))
-
-
 # --- the run --------------------------------------------------------------------------------------------------------
 
 
@@ -167,7 +166,6 @@ def execute(plan: Plan, options: argparse.Namespace) -> int:
     # Imported here, so that --help and --dry-run need none of it.
     from study.display import Display  # noqa: PLC0415
     from study.grid import Queue  # noqa: PLC0415
-    from study.provenance import cores, provenance  # noqa: PLC0415
     from study.result import CellJob  # noqa: PLC0415
     from study.tracking import Tracker  # noqa: PLC0415
     from study.worker import Workers  # noqa: PLC0415
@@ -185,6 +183,8 @@ def execute(plan: Plan, options: argparse.Namespace) -> int:
     ) as display:
         frames = plan.frames
         if waiting:
+            if hint := thread_hint(options.workers, options.threads, cores()):
+                display.say(hint)
             frames = prepare(plan.settings, DATA, cores(), display.data, plan.imported)
         manifest = frames / "manifest.json"
         data = json.loads(manifest.read_text(encoding="utf-8")) if manifest.is_file() else {}
@@ -195,7 +195,16 @@ def execute(plan: Plan, options: argparse.Namespace) -> int:
         queue = Queue(f"{plan.grid.name} {plan.profile} {plan.key}", plan.cells)
         queue.plan(waiting)
         jobs = {
-            key: CellJob(plan.cells[key], key, plan.settings, plan.grid.policy_seeds, frames, DATA, options.device)
+            key: CellJob(
+                plan.cells[key],
+                key,
+                plan.settings,
+                plan.grid.policy_seeds,
+                frames,
+                DATA,
+                options.device,
+                options.threads,
+            )
             for key in waiting
         }
         try:

@@ -14,6 +14,8 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import platform
 import tempfile
 import threading
 import time
@@ -21,7 +23,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import pandas as pd
 
@@ -39,6 +41,8 @@ RESULT = "result"  # artifact folder of a cell run
 RESULT_FILES = (*(f"{part}.safetensors" for part in ARRAYS), "curves.parquet", "cell.json")
 PLAN_VERSION = 1
 VALUE_LIMIT = 4000  # characters of a parameter or tag; MLflow takes 6000 and 8000, its databases 8000
+HOST, PROCESS, ALIVE = "host", "process", "alive"  # tags of an attempt: who writes it, and when last [ms since 1970]
+SIGN = 5.0  # [s] between two signs of life
 PARENT, NOTE = "mlflow.parentRunId", "mlflow.note.content"
 FLUSH = 2.0  # [s] between two writes of live curves
 # Columns [pixels] of the view of all cells that MLflow's pages open with `?viewStateShareKey=cells`.
@@ -71,6 +75,8 @@ class CellRun:
     client: MlflowClient
     seeds: dict[int, str] = field(default_factory=dict)
     _pending: list[Metric] = field(default_factory=list)
+    _tags: dict[str, str] = field(default_factory=dict)
+    _signed: float = -math.inf
     _seen: set[tuple[str, int]] = field(default_factory=set)
     _lock: threading.Lock = field(default_factory=threading.Lock)
     _end: threading.Event = field(default_factory=threading.Event)
@@ -79,6 +85,22 @@ class CellRun:
     def log(self, stage: str, epoch: int, metrics: Mapping[str, float]) -> None:
         """Take the points of one epoch, named such as "test/loss_rec". A point that is there already is left out."""
         self._add((f"{stage}/{name}", epoch, float(value)) for name, value in metrics.items())
+        self._start_writing()
+
+    def note(self, **tags: str) -> None:
+        """Take tags of the attempt; the time goes with them as a sign of life."""
+        with self._lock:
+            self._tags |= tags | {ALIVE: str(time.time_ns() // 1_000_000)}
+        self._start_writing()
+
+    def progress(self, stage: str, done: int, whole: int) -> None:
+        """Take how far the training is; a few times a minute is enough for those who look."""
+        now = time.monotonic()
+        if now - self._signed >= SIGN or done == whole:
+            self._signed = now
+            self.note(progress=f"{stage} {done}/{whole}")
+
+    def _start_writing(self) -> None:
         if self._thread is None and not self._end.is_set():
             self._thread = threading.Thread(target=self._write_on, daemon=True, name=f"log {self.cell.label}")
             self._thread.start()
@@ -99,12 +121,16 @@ class CellRun:
     def _flush(self) -> None:
         with self._lock:
             batch, self._pending = self._pending, []
+            tags, self._tags = self._tags, {}
+        if not batch and not tags:
+            return
         try:
             with _ONE_WRITER:
-                self.client.log_batch(self.run_id, metrics=batch)
+                self.client.log_batch(self.run_id, metrics=batch, tags=[RunTag(*tag) for tag in tags.items()])
         except BaseException:
             with self._lock:  # written in part or whole, it may be written again: the same points are the same rows
                 self._pending = batch + self._pending
+                self._tags = tags | self._tags
             raise
 
     def stop(self, *, wait: bool = True) -> None:
@@ -120,6 +146,17 @@ class CellRun:
         self._flush()
 
 
+@dataclass(frozen=True)
+class Attempt:
+    """One try at a cell as the store knows it; `started` in ms since 1970."""
+
+    run_id: str
+    status: str
+    started: int
+    tags: Mapping[str, str]
+    metrics: Mapping[str, float]
+
+
 class Tracker:
     """The store of results behind one URI and one experiment.
 
@@ -132,6 +169,14 @@ class Tracker:
         self.uri, self.client = self._store.shown, self._store.client
         with guard(self.uri, opening=True), few_tries():
             self.experiment = self._store.experiment(experiment, _welcome)
+
+    @classmethod
+    def look(cls, uri: str = DEFAULT_TRACKING, experiment: str = "study") -> Self | None:
+        """The store, or None where it has no such experiment: looking makes none."""
+        store = open_store(uri)
+        with guard(store.shown, opening=True), few_tries():
+            found = store.client.get_experiment_by_name(experiment)
+        return cls(uri, experiment) if found else None
 
     def _guard(self) -> AbstractContextManager[None]:
         return guard(self.uri)
@@ -275,6 +320,18 @@ class Tracker:
                 found.setdefault(key, run)
         return {key: found[key] for key in keys if key in found}
 
+    def attempts(self, keys: Collection[str]) -> dict[str, list[Attempt]]:
+        """Key -> the tries at that cell, the first first; cells that nobody has tried are left out."""
+        found: dict[str, list[Attempt]] = {}
+        with self._guard():
+            for run in self._search("tags.kind = 'cell'"):
+                key = run.data.tags.get("cell_key")
+                if key in keys:
+                    about = run.info
+                    attempt = Attempt(about.run_id, about.status, about.start_time, run.data.tags, run.data.metrics)
+                    found.setdefault(key, []).append(attempt)
+        return found
+
     def start_cell(
         self, sweep_run_id: str, cell: Cell, key: str, settings: StudySettings, policy_seeds: int
     ) -> CellRun:
@@ -297,6 +354,7 @@ class Tracker:
                 PARENT: sweep_run_id,
             }
             started = time.time_ns() // 1_000_000
+            tags |= {HOST: platform.node(), PROCESS: str(os.getpid()), ALIVE: str(started)}
             run_id = self._create(cell.label, tags, started)
             for run in before:
                 if run.info.status == "RUNNING":
@@ -326,6 +384,8 @@ class Tracker:
             with tempfile.TemporaryDirectory() as folder:
                 for file in sorted(result.save(Path(folder) / RESULT).iterdir()):
                     self.client.log_artifact(cell_run.run_id, str(file), RESULT)
+            if diff := result.facts.get("provenance", {}).get("diff"):
+                self.client.log_text(cell_run.run_id, diff, "uncommitted.diff")
             scores = scores_of(result)
             self._log_seeds(cell_run, result.curves, scores)
             cell_run.finish(cell_points(result.curves))

@@ -25,7 +25,7 @@ from study.command import Parser, run
 from study.config import BadInputError
 from study.cost import cell_cost
 from study.data import DATA, prepare
-from study.plan import Plan, add_plan_options, given_plan
+from study.plan import Plan, add_machine_options, add_plan_options, check_machine, given_plan
 
 if TYPE_CHECKING:  # --help and errors in the settings come without these
     from study.display import Display
@@ -44,7 +44,7 @@ def parser() -> Parser:
         "Exit code 0: all cells are there; 1: cells failed; 75: cells are left, the same command goes on.",
     )
     made.add_argument("--out", type=Path, required=True, metavar="DIR", help="where each result becomes a folder")
-    made.add_argument("--device", default="auto", help="cpu, cuda, cuda:1, ... (default: cuda where there is one)")
+    add_machine_options(made)
     made.add_argument("--limit-seconds", type=float, metavar="S", help="stop by then (default: go on to the end)")
     add_plan_options(made)
     return made
@@ -58,16 +58,13 @@ def main(args: Sequence[str]) -> int:
     if limit is not None and not limit > 0:
         raise BadInputError(f"--limit-seconds is {limit}; it must be above 0")
     plan = given_plan(options)
-    if options.device not in {"auto", "cpu"}:
-        from study.autoencoder import check_device  # noqa: PLC0415 - loads torch, which only a named GPU needs here
-
-        check_device(options.device)
+    check_machine(options)
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # a batch system's stop ends as cleanly as Ctrl-C
     try:
         if limit is not None:
             signal.signal(signal.SIGALRM, signal.default_int_handler)
             signal.setitimer(signal.ITIMER_REAL, limit)
-        return train(plan, options.out, options.device)
+        return train(plan, options.out, options.device, options.threads)
     except KeyboardInterrupt:
         print("\nStopped. Nothing that was finished is lost; the same command goes on.", file=sys.stderr)
         return EXIT_AGAIN if limit is not None and time.monotonic() - began >= limit else EXIT_INTERRUPTED
@@ -75,7 +72,7 @@ def main(args: Sequence[str]) -> int:
         signal.setitimer(signal.ITIMER_REAL, 0)
 
 
-def train(plan: Plan, out: Path, device: str) -> int:
+def train(plan: Plan, out: Path, device: str, threads: int) -> int:
     """Train the cells that `out` lacks, one after the other, and return the exit code."""
     from study.display import Display  # noqa: PLC0415
     from study.provenance import cores  # noqa: PLC0415
@@ -86,7 +83,7 @@ def train(plan: Plan, out: Path, device: str) -> int:
     except OSError as error:
         raise BadInputError(f"cannot write to {out}: {error.strerror}; name another folder with --out") from error
     jobs = {
-        key: CellJob(cell, key, plan.settings, plan.grid.policy_seeds, plan.frames, DATA, device, cores())
+        key: CellJob(cell, key, plan.settings, plan.grid.policy_seeds, plan.frames, DATA, device, threads)
         for key, cell in plan.cells.items()
         if not (out / key).is_dir()
     }

@@ -1,7 +1,7 @@
 """Workers: child processes that train one cell each, and the parent's side of them.
 
 The parent alone speaks to the queue and to the tracker. A child speaks to its parent through a pipe:
-("log", stage, epoch, metrics), ("progress", stage, done, total), and last ("done",) or
+("device", name), ("log", stage, epoch, metrics), ("progress", stage, done, total), and last ("done",) or
 ("failed", whether another try may help, reason).
 """
 
@@ -22,7 +22,6 @@ from study.command import obey_parent
 from study.config import BadInputError
 from study.display import Display
 from study.grid import Queue, Ticket
-from study.provenance import cores
 from study.result import CellJob, CellResult, TrainingDivergedError
 from study.tracking import CellRun, Tracker
 
@@ -38,8 +37,9 @@ def serve(job: CellJob, parent: Connection) -> None:
     """Run a cell in a child process and tell the parent of it."""
     obey_parent()
     try:
-        from study.cell import run_cell  # noqa: PLC0415 - the parent needs no torch
+        from study.cell import choose_device, device_name, run_cell  # noqa: PLC0415 - the parent needs no torch
 
+        parent.send(("device", device_name(choose_device(job))))
         run_cell(
             job,
             lambda *what: parent.send(("log", *what)),
@@ -93,7 +93,6 @@ class Workers:
     ) -> None:
         self._jobs, self._tracker, self._sweep_run = jobs, tracker, sweep_run
         self._queue, self._display = queue, display
-        self._threads = max(1, cores() // count)
         self._slots = list(range(count))
         self._running: list[Worker] = []
         self._tries: dict[str, int] = {}
@@ -124,7 +123,7 @@ class Workers:
             self._display.tick()
 
     def _start(self, ticket: Ticket) -> None:
-        job = dataclasses.replace(self._jobs[ticket.key], threads=self._threads, slot=self._slots.pop(0))
+        job = dataclasses.replace(self._jobs[ticket.key], slot=self._slots.pop(0))
         run = self._tracker.start_cell(self._sweep_run, job.cell, job.key, job.settings, job.policy_seeds)
         if job.result_folder.is_dir():  # trained before; only the commit was cut off
             self._slots.append(job.slot)
@@ -145,7 +144,10 @@ class Workers:
             return
         if kind == "log":
             worker.run.log(*rest)
+        elif kind == "device":
+            worker.run.note(device=rest[0])
         elif kind == "progress":
+            worker.run.progress(*rest)
             self._display.progress(worker.job.key, *rest)
         else:
             worker.outcome = (kind, *rest)

@@ -18,7 +18,7 @@ LAYERS = [
     {"drawings", "card", "preview", "comparison"},
     {"data"},
     {"plan"},
-    {"report", "worker", "intake"},
+    {"report", "worker", "intake", "status", "verify"},
     {"sweep", "train"},
 ]
 OWNERS = {

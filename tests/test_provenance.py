@@ -31,7 +31,7 @@ def checkout(tmp_path):
 def test_a_clean_checkout_is_its_commit(checkout):
     found = provenance(checkout)
     assert found["commit"] == git(checkout, "rev-parse", "HEAD").stdout.strip()
-    assert (found["dirty"], found["diff"]) == (False, "")
+    assert (found["dirty"], found["diff"], found["diff_digest"]) == (False, "", None)
     assert len(found["lock"]) == 64
 
 
@@ -43,6 +43,7 @@ def test_changes_and_new_source_files_are_in_the_diff_and_the_index_stays(checko
     assert found["dirty"]
     assert "+A = 2" in found["diff"]
     assert "+B = 3" in found["diff"]
+    assert len(found["diff_digest"]) == 64
     assert git(checkout, "status", "--porcelain").stdout == before
 
 

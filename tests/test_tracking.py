@@ -298,6 +298,17 @@ def test_a_failed_cell_is_listed_with_its_reason_until_it_is_finished(tracker):
     assert tracker.read_sweep("heads").failed == {}
 
 
+def test_uncommitted_changes_are_kept_with_the_cell_that_they_made(tracker):
+    planned = cells("diff")
+    run = start(tracker, open_sweep(tracker, planned), planned, "diff-0")
+    result = make_result(planned["diff-0"], "diff-0")
+    result.facts["provenance"] |= {"diff": "+A = 2\n", "diff_digest": "d" * 64, "seeds": {"encoder": 0}}
+    tracker.commit(run, result)
+    assert tracker._text(run.run_id, "uncommitted.diff") == "+A = 2\n"
+    tags = tracker.client.get_run(run.run_id).data.tags
+    assert (tags["diff_digest"], json.loads(tags["seeds"])) == ("d" * 64, {"encoder": 0})
+
+
 def test_an_interrupted_cell_does_not_stay_running(tracker):
     planned = cells("stop")
     run = start(tracker, open_sweep(tracker, planned), planned, "stop-0")

@@ -1,0 +1,112 @@
+"""How far a sweep is, as others see it."""
+
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from study.plan import make_plan
+from study.status import SILENT, cell_statuses, main, seconds_left
+from study.tracking import Attempt, Tracker
+
+NOW = 1_800_000_000.0
+PLAN = make_plan("heads", "laptop", {}, {})
+FIRST, *OTHERS = PLAN.cells
+GONE = 2**22 + 1  # no process has a number beyond pid_max
+
+
+def attempt(status, quiet=0.0, host="elsewhere", **more):
+    tags = {"host": host, "process": str(GONE), "alive": str(int((NOW - quiet) * 1000))} | more.pop("tags", {})
+    return Attempt("r", status, int((NOW - 600) * 1000), tags, more)
+
+
+def state(*attempts):
+    return cell_statuses(PLAN, {FIRST: attempts}, NOW, "here")[0]
+
+
+def left(attempts):
+    return seconds_left(PLAN, cell_statuses(PLAN, attempts, NOW, "here"), NOW, frames_ready=True)
+
+
+@pytest.mark.parametrize(
+    ("attempts", "expected"),
+    [
+        ([], "waiting"),
+        ([attempt("FINISHED"), attempt("KILLED")], "finished"),
+        ([attempt("FAILED"), attempt("RUNNING")], "running"),
+        ([attempt("RUNNING"), attempt("FAILED")], "failed"),
+        ([attempt("KILLED")], "waiting"),
+        ([attempt("RUNNING", quiet=SILENT + 1)], "silent"),
+        ([attempt("RUNNING", host="here")], "dead"),
+    ],
+)
+def test_a_cell_is_what_its_attempts_say_and_its_process_does(attempts, expected):
+    assert state(*attempts).state == expected
+
+
+def test_a_running_cell_tells_where_since_when_and_how_far():
+    found = state(attempt("RUNNING", tags={"progress": "encoder 26/120", "device": "CPU"}))
+    assert (found.host, found.process, found.device) == ("elsewhere", str(GONE), "CPU")
+    assert (found.stage, found.epoch, found.epochs) == ("encoder", 3, 12)
+    assert found.since == NOW - 600
+
+
+def test_of_a_traceback_the_line_that_says_something_is_shown():
+    told = "Traceback (most recent call last):\n  File ...\nValueError: no room\n"
+    assert state(attempt("FAILED", tags={"reason": told})).reason == "ValueError: no room"
+    assert state(attempt("FAILED", tags={"reason": "the loss is nan\nat step 3"})).reason == "the loss is nan"
+
+
+def test_what_is_left_follows_what_was_measured_and_how_many_run():
+    nothing = left({})
+    slow = {FIRST: [attempt("FINISHED", **{"seconds/cell": 1e5})]}
+    assert 0 < nothing < left(slow)
+    running = {key: [attempt("RUNNING")] for key in OTHERS[:2]}
+    assert left(running) == pytest.approx(nothing / 2)
+    assert left({key: [attempt("FINISHED")] for key in PLAN.cells}) == 0
+
+
+def test_where_nothing_was_tracked_all_cells_wait_and_nothing_is_made(tmp_path):
+    root = Path(__file__).parent.parent
+    (tmp_path / "sweeps").symlink_to(root / "sweeps")
+    done = subprocess.run(
+        [sys.executable, "-m", "study.sweep", "status", "heads"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
+        env=os.environ | {"PYTHONPATH": str(root)},
+    )
+    title, frames, *lines = done.stdout.splitlines()
+    assert "0 of 4 cells finished, 4 waiting" in title
+    assert "not made yet" in frames
+    assert [line.split()[-1] for line in lines] == ["waiting"] * 4
+    assert [path.name for path in tmp_path.iterdir()] == ["sweeps"]
+
+
+def test_a_store_without_sweeps_is_left_as_it_is(tmp_path, capsys):
+    uri = f"sqlite:///{tmp_path}/mlflow.db"
+    tracker = Tracker(uri, "another")
+    assert main(["heads", "--tracking", uri, "--json"]) == 0
+    assert {cell["state"] for cell in json.loads(capsys.readouterr().out)["cells"]} == {"waiting"}
+    assert tracker.client.get_experiment_by_name("study") is None
+
+    tracker = Tracker(uri)
+    sweep = tracker.open_sweep(PLAN.grid, PLAN.profile, PLAN.settings, PLAN.cells, {}, {})
+    run = tracker.start_cell(sweep, PLAN.cells[FIRST], FIRST, PLAN.settings, PLAN.grid.policy_seeds)
+    run.note(device="CPU")
+    run.progress("policy", 7, 100)
+    for _ in range(200):
+        if "progress" in tracker.attempts([FIRST])[FIRST][0].tags:
+            break
+        time.sleep(0.1)
+    assert main(["heads", "--tracking", uri, "--json"]) == 0
+    cell = json.loads(capsys.readouterr().out)["cells"][0]
+    assert (cell["state"], cell["stage"], cell["epoch"], cell["device"]) == ("running", "policy", 7, "CPU")
+    assert (cell["host"], cell["process"]) == (platform.node(), str(os.getpid()))
+    tracker.interrupt(run)
