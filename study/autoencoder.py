@@ -22,7 +22,9 @@ import tempfile
 import threading
 import time
 import warnings
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -50,6 +52,7 @@ from study.config import (
     FramesSettings,
     one_of,
 )
+from study.cost import size
 from study.frames import Frames, epoch_order
 from study.result import Arrays, TrainingDivergedError
 
@@ -65,7 +68,9 @@ CHECKPOINT_SECONDS = 60.0  # between two checkpoints of 23 MB: what a kill costs
 DIGEST = hashlib.sha256().digest_size  # bytes, before what torch writes
 ZIP = b"PK"  # how a checkpoint from before there were digests begins
 PROGRESS_SECONDS = 0.25
-RESIDENT_SHARE = 0.6  # of a GPU's free memory that the data may fill; the rest is for activations
+PREFETCHED = 3  # batches on their way to a GPU that has no room for all data
+FUSED_STEPS = 10_000  # compiling takes about a minute: it must be worth it
+SPARE_BYTES = 1 << 30  # of a GPU's memory, for the libraries' work space and for gaps
 _CORE_NUMBERS = CHANNELS[-1] * CORE * CORE
 _PIXELS = HEADS["rec"] * IMAGE * IMAGE
 
@@ -221,7 +226,8 @@ class MultiHeadAutoencoder(lightning.LightningModule):
         super().__init__()
         if heads not in HEAD_SETS:
             raise one_of("head set", heads, HEAD_SETS)
-        self.settings = settings
+        self.settings, self.beta = settings, settings.beta
+        self.head_weights = {head: settings.head_weights.get(head, 1.0) for head in HEAD_SETS[heads]}
         self.automatic_optimization = False  # gradients come head by head, see `losses`
         self.encoder = Encoder(variational=settings.beta > 0)
         self.decoders = nn.ModuleDict({head: Decoder(HEADS[head]) for head in HEAD_SETS[heads]})
@@ -232,6 +238,7 @@ class MultiHeadAutoencoder(lightning.LightningModule):
         self.noise_seed = encoder_seed
         self.noise: torch.Generator | None = None
         self.noise_state: Tensor | None = None  # to start from, when a training goes on
+        self._fused: _Fused | None = None
         self.reset_means()
 
     def forward(self, images: Tensor) -> dict[str, Tensor]:
@@ -239,11 +246,12 @@ class MultiHeadAutoencoder(lightning.LightningModule):
         z = self.encoder(images)
         return {head: decoder(z) for head, decoder in self.decoders.items()}
 
-    def losses(self, images: Tensor, masks: Tensor, *, gradients: bool = False) -> Tensor:
+    def losses(self, images: Tensor, masks: Tensor, noise: Tensor | None = None, *, by_head: bool = False) -> Tensor:
         """The losses named in `metrics`, of images [B, 64, 64, 3] uint8 and masks [B, 2, 512] uint8.
 
-        With `gradients`, those of the total loss are added to the parameters' on the way: one head after the other, so
-        that memory for the activations of one head suffices. The losses themselves never carry gradients.
+        `noise` [B, 64] float32 moves z within its variance, when variational. The losses carry gradients. With
+        `by_head` they carry none: those of the total loss are added to the parameters' on the way, one head after the
+        other, so that memory for the activations of one head suffices.
         """
         pixels = to_float(images)
         targets = {"rec": pixels} | unpack(masks, [head for head in self.decoders if head in MASKS])
@@ -254,43 +262,55 @@ class MultiHeadAutoencoder(lightning.LightningModule):
         if self.encoder.log_variance is not None:
             mean, log_variance = z.float(), self.encoder.log_variance(features).float()
             kl = (mean.square() + log_variance.exp() - 1 - log_variance).sum(1).mean() / (2 * _PIXELS)
-            divergence.append(kl.detach())
-            ends.append((self.settings.beta * kl, None))
-            if self.training:  # on the test split the mean stands for z, as for the policies
-                z = mean + torch.exp(log_variance / 2) * self._noise(mean)
-        given = z.detach().requires_grad_(gradients)
+            divergence.append(kl.detach() if by_head else kl)
+            ends.append((self.beta * kl, None))
+            if noise is not None:  # on the test split the mean stands for z, as for the policies
+                z = mean + torch.exp(log_variance / 2) * noise
+        given = z.detach().requires_grad_() if by_head else z
         parts = []
-        weights = [self.settings.head_weights.get(head, 1.0) for head in self.decoders]
+        weights = [self.head_weights[head] for head in self.decoders]
         for weight, (head, decoder) in zip(weights, self.decoders.items(), strict=True):
             loss = functional.binary_cross_entropy_with_logits(decoder(given), targets[head])
-            if gradients:
+            if by_head:
                 torch.autograd.backward(weight * loss)
-            parts.append(loss.detach())
-        if gradients:
+            parts.append(loss.detach() if by_head else loss)
+        if by_head:
             outputs, incoming = zip(*ends, (z, given.grad), strict=True)
             torch.autograd.backward(outputs, incoming)
-        weights += [self.settings.beta] * len(divergence)
+        weights += [self.beta] * len(divergence)
         parts += divergence
         return torch.stack([sum(w * part for w, part in zip(weights, parts, strict=True)), *parts])  # type: ignore[list-item]
 
-    def _noise(self, like: Tensor) -> Tensor:
+    def _noise(self, count: int) -> Tensor | None:
+        if not self.beta:
+            return None
         if self.noise is None:
-            self.noise = _generator(self.noise_seed, "noise", like.device)
+            self.noise = _generator(self.noise_seed, "noise", self.device)
             if self.noise_state is not None:
                 self.noise.set_state(self.noise_state)
-        return torch.randn(like.shape, generator=self.noise, device=like.device)
+        return torch.randn((count, LATENT), generator=self.noise, device=self.device)
 
     def training_step(self, batch: tuple[Tensor, Tensor]) -> None:
         """One step of the optimiser."""
         optimizer = self.optimizers(use_pl_optimizer=False)
         assert isinstance(optimizer, torch.optim.Optimizer)
         optimizer.zero_grad()
-        self._note("train", self.losses(*batch, gradients=True), len(batch[0]))
+        self._note("train", self.gradients(*batch, self._noise(len(batch[0]))), len(batch[0]))
         optimizer.step()
 
     def validation_step(self, batch: tuple[Tensor, Tensor]) -> None:
         """Losses of a batch of the test split."""
-        self._note("test", self.losses(*batch), len(batch[0]))
+        losses = self._fused(*batch, None) if self._fused else None
+        self._note("test", self.losses(*batch) if losses is None else losses, len(batch[0]))
+
+    def gradients(self, images: Tensor, masks: Tensor, noise: Tensor | None) -> Tensor:
+        """The losses of a batch, as `losses` has them; adds the gradients of their total to the parameters'."""
+        losses = self._fused(images, masks, noise) if self._fused else None
+        return self.losses(images, masks, noise, by_head=True) if losses is None else losses
+
+    def fuse(self) -> None:
+        """From now on take losses and gradients by torch.compile, where that works."""
+        self._fused = _Fused(self)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """Adam (Sec. IV-B)."""
@@ -307,20 +327,61 @@ class MultiHeadAutoencoder(lightning.LightningModule):
         self.totals: dict[str, list[Tensor]] = {"train": [], "test": []}
 
     def means(self) -> dict[str, float]:
-        """Mean of each loss over the frames seen since the last reset, e.g. "train/loss_rec"."""
+        """Mean of each loss over the frames seen since the last reset, e.g. "train/loss_rec"; waits for the device."""
         found: dict[str, float] = {}
-        for split, sums in self.sums.items():
-            *values, count = sums.tolist()
+        rows = torch.stack([sums.to(self.device) for sums in self.sums.values()]).tolist()
+        for split, (*values, count) in zip(self.sums, rows, strict=True):
             found |= {f"{split}/{name}": value / count for name, value in zip(self.metrics, values, strict=True)}
         return found
 
-    def not_finite(self, split: Split) -> int | None:
-        """Position of the first batch since the last call whose loss was not a finite number."""
-        totals, self.totals[split] = self.totals[split], []
-        if not totals:
+    def not_finite(self, split: Split) -> int:
+        """Position since the last reset of the first batch whose loss was not a finite number; there is one."""
+        return int(torch.stack(self.totals[split]).isfinite().int().argmin())
+
+
+class _Fused:
+    """An autoencoder's losses and their gradients by torch.compile: one graph for each size of batch and each split.
+
+    A call gives the losses, and in training adds the gradients; or None where it cannot compile, which it says once.
+    """
+
+    def __init__(self, module: MultiHeadAutoencoder) -> None:
+        torch.compiler.reset()  # graphs of an encoder trained before would count against the limit
+        self.module = module
+        self.function: Callable[..., Tensor] | None = torch.compile(module.losses, dynamic=False, fullgraph=True)
+        self.compiled: set[tuple[int, bool]] = set()  # sizes, each in training or not
+
+    def __call__(self, *batch: Tensor | None) -> Tensor | None:
+        kind = len(batch[0]), self.module.training  # type: ignore[arg-type]
+        if self.function is None or kind in self.compiled:
+            return self._compute(*batch)
+        before = [buffer.clone() for buffer in self.module.buffers()]
+        try:
+            losses = self._compute(*batch)
+        except torch.OutOfMemoryError:
+            raise
+        except Exception as error:  # noqa: BLE001 - of any kind; what else may be wrong shows without it
+            warnings.warn(
+                f"torch.compile failed ({type(error).__name__}: {str(error).strip().splitlines()[0]}); the encoder "
+                "trains without it, more slowly (TORCH_COMPILE_DISABLE=1 leaves it out)",
+                RuntimeWarning,
+                stacklevel=2,
+            )
+            self.function = None
+            self.module.zero_grad()
+            for buffer, value in zip(self.module.buffers(), before, strict=True):
+                buffer.copy_(value)
             return None
-        bad = ~torch.stack(totals).isfinite()
-        return int(bad.int().argmax()) if bool(bad.any()) else None
+        self.compiled.add(kind)
+        return losses
+
+    def _compute(self, *batch: Tensor | None) -> Tensor | None:
+        if self.function is None:
+            return None
+        losses = self.function(*batch)
+        if self.module.training:
+            torch.autograd.backward(losses[0])
+        return losses.detach()
 
 
 def to_float(images: Tensor) -> Tensor:
@@ -343,23 +404,67 @@ def unpack(masks: Tensor, heads: Sequence[str]) -> dict[str, Tensor]:
 
 @dataclass(frozen=True)
 class _Batches:
-    """Slices of the frame arrays, one tuple (images, masks) for each part of the order."""
+    """Slices of the frame arrays on `device`, one tuple (images, masks) for each part of the order.
+
+    The arrays are tensors there, or memory-mapped. From these, batches for a GPU are gathered and copied ahead.
+    """
 
     images: Bytes | Tensor
     masks: Bytes | Tensor
     parts: Sequence[Indices]
+    device: torch.device
 
     def __len__(self) -> int:
         return len(self.parts)
 
     def __iter__(self) -> Iterator[tuple[Tensor, Tensor]]:
         if isinstance(self.images, Tensor) and isinstance(self.masks, Tensor):
-            device = self.images.device
-            for rows in [torch.from_numpy(part).to(device) for part in self.parts]:
+            order = torch.from_numpy(np.concatenate(self.parts)).to(self.device)
+            for rows in order.split([len(part) for part in self.parts]):
                 yield self.images[rows], self.masks[rows]
-        else:
+        elif self.device.type == "cpu":
             for part in self.parts:
                 yield torch.from_numpy(self.images[part]), torch.from_numpy(self.masks[part])
+        else:
+            yield from prefetched(self.images, self.masks, self.parts, self.device)
+
+
+def prefetched(
+    images: Bytes | Tensor, masks: Bytes | Tensor, parts: Sequence[Indices], device: torch.device
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """Images and masks of each part on a device: while one batch is computed, a thread gathers and copies the next.
+
+    The copies run from pinned memory on a stream of their own, so nobody waits for them but the device itself.
+    """
+    gpu = device.type == "cuda"
+    side = torch.cuda.Stream(device) if gpu else None  # type: ignore[no-untyped-call]
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="The given NumPy array is not writable")
+        sources = torch.as_tensor(images), torch.as_tensor(masks)
+
+    def copy(source: Tensor, rows: Tensor) -> Tensor:
+        gathered = torch.empty((len(rows), *source.shape[1:]), dtype=source.dtype, pin_memory=gpu)
+        torch.index_select(source, 0, rows, out=gathered)
+        with torch.cuda.stream(side):
+            return gathered.to(device, non_blocking=True)
+
+    def fetch(part: Indices) -> tuple[tuple[Tensor, Tensor], torch.cuda.Event | None]:
+        rows = torch.from_numpy(part)
+        batch = copy(sources[0], rows), copy(sources[1], rows)
+        return batch, side.record_event() if side else None
+
+    with ThreadPoolExecutor(1) as pool:
+        ahead = deque(pool.submit(fetch, part) for part in parts[:PREFETCHED])
+        for part in [*parts[PREFETCHED:], *[None] * len(ahead)]:
+            batch, copied = ahead.popleft().result()
+            if part is not None:
+                ahead.append(pool.submit(fetch, part))
+            if copied is not None:
+                now = torch.cuda.current_stream(device)
+                now.wait_event(copied)
+                for tensor in batch:
+                    tensor.record_stream(now)  # its memory is not given to the next copy before it has been used
+            yield batch
 
 
 @dataclass(frozen=True)
@@ -431,6 +536,32 @@ def choose_precision(setting: Literal["auto", "fp32", "bf16"], device: torch.dev
     else:
         native = "amx_bf16" in _cpu_flags() or "avx512_bf16" in _cpu_flags()
     return "bf16" if native else "fp32"
+
+
+def step_bytes(heads: str, batch: int, precision: str) -> int:
+    """Memory that a training step takes on a GPU beside the data; from above [bytes].
+
+    For each image: every layer's output before and after its BatchNorm and one gradient, in the type of training, and
+    five times each head's pixels in float32 (target, logits, their gradient and what leads there).
+    """
+    sides = list(itertools.accumulate(CHANNELS, lambda side, _: (side - KERNEL) // STRIDE + 1, initial=IMAGE))[1:]
+    layers = sum(channels * side**2 for channels, side in zip(CHANNELS, sides, strict=True))
+    colours = sum(HEADS[head] for head in HEAD_SETS[heads])
+    image = 3 * (2 if precision == "bf16" else 4) * layers * (1 + len(HEAD_SETS[heads]))
+    image += 5 * 4 * (HEADS["rec"] + colours) * IMAGE**2
+    return batch * image + SPARE_BYTES
+
+
+def check_memory(device: torch.device, heads: str, batch: int, precision: str) -> int:
+    """Bytes of a device's memory that are free for the data. Raises BadInputError when a training step cannot fit."""
+    free, _ = torch.cuda.mem_get_info(device)
+    need = step_bytes(heads, batch, precision)
+    if need > free:
+        raise BadInputError(
+            f"{device} has {size(free)} of free memory, and batch {batch} with heads {heads} needs about {size(need)}; "
+            "lower --encoder.batch, or end what else runs there"
+        )
+    return free - need
 
 
 def _cpu_flags() -> set[str]:
@@ -542,6 +673,7 @@ def train_encoder(
     precision = choose_precision(settings.precision, target)
     plan = plan_training(frames, fraction, encoder_seed, settings, frames_settings)
     module = MultiHeadAutoencoder(heads, settings, encoder_seed)
+    room = check_memory(target, heads, settings.batch, precision) if target.type == "cuda" else 0
     training = {
         "heads": heads,
         "fraction": fraction,
@@ -557,7 +689,7 @@ def train_encoder(
     course = _Course(module, plan, training, checkpoint, log, progress)
     course.resume()
     if course.state.epoch < plan.epochs:
-        _fit(module, _Data(frames, plan, course.state, target), course, target, precision)
+        _fit(module, _Data(frames, plan, course.state, target, room), course, target, precision)
         course.save()
     encoder = {name: value.numpy(force=True).copy() for name, value in module.encoder.state_dict().items()}
     return TrainedEncoder(
@@ -573,25 +705,25 @@ def train_encoder(
 class _Data(lightning.LightningDataModule):
     """The batches of the epoch that a training is in, from its step on."""
 
-    def __init__(self, frames: Frames, plan: _Plan, state: _State, device: torch.device) -> None:
+    def __init__(self, frames: Frames, plan: _Plan, state: _State, device: torch.device, room: int) -> None:
         super().__init__()
-        self.plan, self.state = plan, state
-        self.images, self.masks = resident(frames, device)
+        self.plan, self.state, self.device = plan, state, device
+        self.images, self.masks = resident(frames, device, room)
 
     def train_dataloader(self) -> _Batches:
-        return _Batches(self.images, self.masks, self.plan.parts(self.state.epoch)[self.state.step :])
+        return self._batches(self.plan.parts(self.state.epoch)[self.state.step :])
 
     def val_dataloader(self) -> _Batches:
         test = self.plan.test
-        return _Batches(self.images, self.masks, np.array_split(test, math.ceil(len(test) / self.plan.batch)))
+        return self._batches(np.array_split(test, math.ceil(len(test) / self.plan.batch)))
+
+    def _batches(self, parts: Sequence[Indices]) -> _Batches:
+        return _Batches(self.images, self.masks, parts, self.device)
 
 
-def resident(frames: Frames, device: torch.device) -> tuple[Bytes | Tensor, Bytes | Tensor]:
-    """Images and masks on a GPU where they fit, else as they are: memory-mapped."""
-    if device.type == "cpu":
-        return frames.images, frames.masks
-    free, _ = torch.cuda.mem_get_info(device)
-    if frames.images.nbytes + frames.masks.nbytes > RESIDENT_SHARE * free:
+def resident(frames: Frames, device: torch.device, room: int) -> tuple[Bytes | Tensor, Bytes | Tensor]:
+    """Images and masks on a GPU where they fit into `room` bytes of it, else as they are: memory-mapped."""
+    if device.type == "cpu" or frames.images.nbytes + frames.masks.nbytes > room:
         return frames.images, frames.masks
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="The given NumPy array is not writable")
@@ -615,7 +747,7 @@ class _Course(lightning.Callback):
         self.state = _State()
         self.optimizer: torch.optim.Optimizer | None = None
         self.optimizer_state: dict[str, Any] | None = None
-        self.checked = 0  # step of this epoch up to which losses are known to be finite
+        self.resumed = 0  # step of this epoch that this process started from
         self.started = self.saved = self.shown = time.monotonic()
         self.sigterm = signal.getsignal(signal.SIGTERM)
 
@@ -634,7 +766,7 @@ class _Course(lightning.Callback):
         self.optimizer_state = content["optimizer"]
         rows = [(str(split), int(epoch), str(metric), float(value)) for split, epoch, metric, value in content["rows"]]
         self.state = _State(content["epoch"], content["step"], content["seconds"], rows)
-        self.checked = self.state.step
+        self.resumed = self.state.step
         for epoch, lines in itertools.groupby(rows, key=lambda row: row[1]):
             self.report(epoch, {f"{split}/{metric}": value for split, _, metric, value in lines})
 
@@ -643,7 +775,9 @@ class _Course(lightning.Callback):
         now = time.monotonic()
         self.state.seconds += now - self.started
         self.started = self.saved = now
-        self._check("train")
+        sums = self.module.sums["train"].cpu()
+        if not sums.isfinite().all():
+            raise self._diverged("train")
         if self.checkpoint is None:
             return
         assert self.optimizer is not None
@@ -654,7 +788,7 @@ class _Course(lightning.Callback):
             "seconds": self.state.seconds,
             "rows": [list(row) for row in self.state.rows],
             "network": self.module.state_dict(),
-            "sums": self.module.sums["train"].cpu(),
+            "sums": sums,
             "optimizer": self.optimizer.state_dict(),
             "noise": None if self.module.noise is None else self.module.noise.get_state(),
         }
@@ -680,11 +814,12 @@ class _Course(lightning.Callback):
             self.save()
 
     def on_train_epoch_end(self, *_: object) -> None:
-        self._check("train")
-        self._check("test")
         losses = self.module.means()
+        for name, value in losses.items():
+            if not math.isfinite(value):
+                raise self._diverged("train" if name.startswith("train") else "test")
         self.module.reset_means()
-        self.state.epoch, self.state.step, self.checked = self.state.epoch + 1, 0, 0
+        self.state.epoch, self.state.step, self.resumed = self.state.epoch + 1, 0, 0
         for name, value in losses.items():
             split, metric = name.split("/")
             self.state.rows.append((split, self.state.epoch, metric, value))
@@ -692,20 +827,21 @@ class _Course(lightning.Callback):
         if time.monotonic() - self.saved >= CHECKPOINT_SECONDS and self.state.epoch < self.plan.epochs:
             self.save()
 
-    def _check(self, split: Split) -> None:
-        bad = self.module.not_finite(split)
-        if bad is not None:
-            where = f"step {self.checked + bad + 1}" if split == "train" else "its test split"
-            raise TrainingDivergedError(
-                f"the loss is not a finite number in epoch {self.state.epoch + 1}, {where}; lower --encoder.lr"
-            )
-        if split == "train":
-            self.checked = self.state.step
+    def _diverged(self, split: Split) -> TrainingDivergedError:
+        step = self.resumed + self.module.not_finite(split) + 1
+        where = f"step {step}" if split == "train" else "its test split"
+        return TrainingDivergedError(
+            f"the loss is not a finite number in epoch {self.state.epoch + 1}, {where}; lower --encoder.lr"
+        )
 
 
 def _fit(module: MultiHeadAutoencoder, data: _Data, course: _Course, device: torch.device, precision: str) -> None:
     if device.type == "cpu":
         _keep_memory()
+    else:
+        module.to(memory_format=torch.channels_last)
+        if (data.plan.epochs - data.state.epoch) * data.plan.steps >= FUSED_STEPS:
+            module.fuse()
     with _quiet():
         trainer = lightning.Trainer(
             accelerator="gpu" if device.type == "cuda" else "cpu",
@@ -719,6 +855,7 @@ def _fit(module: MultiHeadAutoencoder, data: _Data, course: _Course, device: tor
             enable_progress_bar=False,
             enable_model_summary=False,
             num_sanity_val_steps=0,
+            benchmark=device.type == "cuda",  # sizes of batches hardly change: let cuDNN try which kernel is fastest
             reload_dataloaders_every_n_epochs=1,
         )
         try:

@@ -118,21 +118,25 @@ class Draws(NamedTuple):
     bits: dict[str, tuple[Tensor, Tensor]]
 
 
-def draw_epoch(seeds: Sequence[int], epoch: int, frames: int) -> Draws:
+def draw_epoch(seeds: Sequence[int], epoch: int, frames: int, device: torch.device | str = "cpu") -> Draws:
     """The order of the data and the dropout bits of each seed, a function of (seed, epoch) only.
 
-    Made on the CPU whatever the device, so that a seed means the same everywhere; one upload an epoch.
+    Made on the CPU whatever the device, so that a seed means the same everywhere; a GPU then copies both arrays while
+    it computes.
     """
     words = {name: tuple(width // _WORD for width in widths[1:-1]) for name, widths in WIDTHS.items()}
-    ends = np.cumsum([0, *(frames * each for layers in words.values() for each in layers)])
-    order = np.empty((len(seeds), frames), np.int64)
-    bits = np.empty((len(seeds), ends[-1]), np.int32)
+    ends = np.cumsum([0, *(frames * each for layers in words.values() for each in layers)]).tolist()
+    pinned = torch.device(device).type == "cuda"
+    order = torch.empty((len(seeds), frames), dtype=torch.int64, pin_memory=pinned)
+    bits = torch.empty((len(seeds), ends[-1]), dtype=torch.int32, pin_memory=pinned)
+    orders, random_words = order.numpy(), bits.numpy()
     for row, seed in enumerate(seeds):
         rng = np.random.Generator(np.random.SFC64([seed, _EPOCH, epoch]))
-        order[row] = rng.permutation(frames)
-        bits[row] = rng.bit_generator.random_raw(math.ceil(ends[-1] / 2)).view(np.int32)[: ends[-1]]
-    parts = iter([torch.from_numpy(bits[:, a:b]) for a, b in itertools.pairwise(ends)])
-    return Draws(torch.from_numpy(order), {name: (next(parts), next(parts)) for name in WIDTHS})
+        orders[row] = rng.permutation(frames)
+        random_words[row] = rng.bit_generator.random_raw(math.ceil(ends[-1] / 2)).view(np.int32)[: ends[-1]]
+    there = bits.to(device, non_blocking=True)
+    parts = iter([there[:, a:b] for a, b in itertools.pairwise(ends)])
+    return Draws(order.to(device, non_blocking=True), {name: (next(parts), next(parts)) for name in WIDTHS})
 
 
 def initial_weights(seed: int) -> Iterator[tuple[str, Tensor]]:
@@ -362,7 +366,8 @@ class PolicyData:
 class PolicyEnsemble(lightning.LightningModule):
     """S policies as stacked tensors: for each network a row of numbers a seed, and its layers as views of the rows.
 
-    One training step is one batch of every seed. `after_epoch(epoch, {split: METRICS [4, S]})` hears of each epoch.
+    One training step is one batch of every seed. `after_epoch(epoch, {split: METRICS [4, S]})` hears of each epoch:
+    on a GPU the only moment at which anyone waits for it.
     """
 
     def __init__(
@@ -371,7 +376,7 @@ class PolicyEnsemble(lightning.LightningModule):
         settings: PolicySettings,
         data: PolicyData,
         crew: Crew | None,
-        after_epoch: Callable[[int, dict[str, Tensor]], None],
+        after_epoch: Callable[[int, Arrays], None],
     ) -> None:
         super().__init__()
         self.automatic_optimization = False
@@ -379,6 +384,7 @@ class PolicyEnsemble(lightning.LightningModule):
         self._data, self._crew, self._after_epoch = data, crew, after_epoch
         self.stacks = nn.ParameterDict({name: nn.Parameter(stack(seeds, name)) for name in WIDTHS})
         self._scratch = Scratch()
+        self._ahead: Draws | None = None
         each = [slice(row, row + 1) for row in range(len(self.seeds))]
         self._groups = each if crew else [slice(0, len(self.seeds))]
 
@@ -410,12 +416,14 @@ class PolicyEnsemble(lightning.LightningModule):
         }
 
     def on_train_epoch_start(self) -> None:
-        """Draw all chance of the epoch, and bring the labels into its order."""
-        order, bits = draw_epoch(self.seeds, self.current_epoch, len(self._data.x))
-        self._order = order.to(self.device)
-        self._bits = {name: [words.to(self.device) for words in layers] for name, layers in bits.items()}
+        """Take the epoch's chance, and bring the labels into its order."""
+        self._order, self._bits = self._ahead or self._draw(self.current_epoch)
+        self._ahead = None
         self._steering = self._data.labels.steering[self._order]
         self._acceleration = self._data.labels.acceleration[self._order]
+
+    def _draw(self, epoch: int) -> Draws:
+        return draw_epoch(self.seeds, epoch, len(self._data.x), self._data.x.device)
 
     def training_step(self, batch: int) -> None:
         """One batch of every seed: the rows at `batch` in each seed's own order."""
@@ -446,10 +454,11 @@ class PolicyEnsemble(lightning.LightningModule):
 
     def on_train_epoch_end(self) -> None:
         """Measure every policy without dropout."""
-        self._after_epoch(
-            self.current_epoch + 1,
-            {split: measure(*self.outputs(x), labels) for split, (x, labels) in self._data.views.items()},
-        )
+        views = self._data.views
+        measured = torch.stack([measure(*self.outputs(x), labels) for x, labels in views.values()])
+        if self._crew is None and self.current_epoch + 1 < self.settings.epochs:
+            self._ahead = self._draw(self.current_epoch + 1)  # a GPU is still busy with this epoch
+        self._after_epoch(self.current_epoch + 1, dict(zip(views, measured.cpu().numpy(), strict=True)))
 
     def outputs(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Steering [S, N] and logits [S, N, 3] without dropout."""
@@ -509,8 +518,7 @@ def train_policies(
     data = _policy_data(scaling, (z_train, labels_train), (z_test, labels_test), torch.device(device))
     points: list[pd.DataFrame] = []
 
-    def after_epoch(epoch: int, measured: dict[str, Tensor]) -> None:
-        values = {split: metrics.cpu().numpy() for split, metrics in measured.items()}
+    def after_epoch(epoch: int, values: Arrays) -> None:
         for metrics in values.values():
             broken = ~np.isfinite(metrics).all(0)
             if broken.any():
@@ -635,6 +643,11 @@ def _fit(ensemble: PolicyEnsemble, settings: PolicySettings, steps: int, device:
         )
         try:
             trainer.fit(ensemble, train_dataloaders=range(steps))
+        except torch.OutOfMemoryError as error:
+            raise BadInputError(
+                f"{device} has too little memory for {len(ensemble.seeds)} policies at batch {settings.batch} "
+                f"({error}); lower --policy.batch or --policy_seeds, or end what else runs there"
+            ) from error
         except SystemExit as error:
             if isinstance(error.__context__, KeyboardInterrupt):  # Lightning makes Ctrl-C an exit with code 1
                 raise KeyboardInterrupt from None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import itertools
 from typing import Any
 
@@ -99,6 +100,24 @@ def test_all_seeds_as_one_group_come_out_as_one_group_each(
     np.testing.assert_allclose(
         together.weights["acceleration_0_weight"], fifteen.weights["acceleration_0_weight"], rtol=1e-3, atol=1e-4
     )
+
+
+def test_inside_an_epoch_nobody_waits_for_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The way of a GPU: no number leaves it before the epoch's end."""
+    asked: list[str] = []
+    step = policy.PolicyEnsemble.training_step
+
+    @functools.wraps(step)  # Lightning looks at its arguments
+    def watched(*arguments: Any) -> None:
+        with pytest.MonkeyPatch.context() as patch:
+            for name in ("item", "tolist", "cpu", "numpy", "nonzero", "__bool__", "__int__", "__float__"):
+                patch.setattr(torch.Tensor, name, lambda *_, name=name, **__: asked.append(name))
+            step(*arguments)
+
+    monkeypatch.setattr(policy.PolicyEnsemble, "training_step", watched)
+    monkeypatch.setattr(policy, "_crew", lambda device: contextlib.nullcontext())
+    train()
+    assert asked == []
 
 
 def test_training_leaves_the_number_of_threads_as_it_was() -> None:
@@ -403,6 +422,14 @@ def test_threads_come_back_after_a_failure() -> None:
     with pytest.raises(TrainingDivergedError):
         train_policies(z, z, huge, huge, [0], SETTINGS)
     assert torch.get_num_threads() == threads
+
+
+def test_too_little_device_memory_names_the_settings_that_lower_it() -> None:
+    def progress(done: int, total: int) -> None:
+        raise torch.OutOfMemoryError("tried to allocate 9 GiB")
+
+    with pytest.raises(BadInputError, match=r"for 2 policies at batch 64 .*9 GiB.*--policy.batch or --policy_seeds"):
+        train(progress=progress)
 
 
 @dataclasses.dataclass(frozen=True)
