@@ -420,7 +420,7 @@ class _Batches:
     def __iter__(self) -> Iterator[tuple[Tensor, Tensor]]:
         if isinstance(self.images, Tensor) and isinstance(self.masks, Tensor):
             order = torch.from_numpy(np.concatenate(self.parts)).to(self.device)
-            for rows in order.split([len(part) for part in self.parts]):
+            for rows in torch.split(order, [len(part) for part in self.parts]):
                 yield self.images[rows], self.masks[rows]
         elif self.device.type == "cpu":
             for part in self.parts:
