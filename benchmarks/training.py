@@ -1,172 +1,460 @@
-"""Training against what one would write first: `python benchmarks/training.py [laptop|paper]`.
+"""Training against what one would write first, and against the machine's limits: `python benchmarks/training.py`.
 
-Policies: all 15 seeds by `study.policy` against one plain Lightning fit (nn.Sequential, DataLoader over a
-TensorDataset, validation after each epoch), times 15. Both are timed by the epoch, side by side in one process and turn
-about, so that a busy machine slows both; what is printed is medians with the lowest and highest. Latents are random:
-values cost no time. OMP_NUM_THREADS=1 keeps both on one core: on a busy machine torch's threads wait for each other at
-every operation, which slows the plain fit out of all proportion.
+Encoder: `train_encoder` as a sweep calls it (Lightning, checkpoints, progress and losses told through a pipe) against a
+bare torch loop over tensors in memory with the same networks, precision and optimiser, turn about by the epoch, and
+against a stock Lightning template with a DataLoader of two workers (`plain.py`). Policies: all 15 seeds by
+`train_policies` against one plain fit after the other. An epoch is all of it: training, evaluating the test split,
+reporting. Data are random: values cost no time. Printed are medians with the lowest and highest; the floor of a stage
+is what its multiplications take at the speed of a large matrix product on this machine, or its bytes at the speed of a
+copy, whichever takes longer. `--quick` tries everything on almost no data, and keeps nothing.
 """
 
 from __future__ import annotations
 
+import argparse
 import itertools
 import json
-import logging
-import platform
+import multiprocessing
+import os
+import subprocess
 import sys
+import tempfile
+import threading
 import time
-import warnings
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import lightning
 import numpy as np
 import pandas as pd
+import plain
 import torch
-from torch import Tensor, nn
-from torch.nn import functional
-from torch.utils.data import DataLoader, TensorDataset
 
-from study.config import DROPOUT, PolicySettings
+from study import autoencoder
+from study.autoencoder import MultiHeadAutoencoder, choose_precision, plan_training, train_encoder
+from study.config import (
+    CHANNELS,
+    CORE,
+    HEAD_SETS,
+    HEADS,
+    IMAGE,
+    KERNEL,
+    LATENT,
+    EncoderSettings,
+    FramesSettings,
+    PolicySettings,
+)
+from study.frames import SHAPES, Frames
 from study.policy import WIDTHS, train_policies
+from study.provenance import provenance
 
 RESULT = Path(__file__).parent / "results" / "training.json"
-SIZES = {"laptop": (10_000, 2_500, 512), "paper": (64_000, 16_000, 2048)}  # train, test, batch
+BATCHES = {"laptop": 128, "paper": 2048}  # of encoders
+FRAMES = {"laptop": (3072, 768), "paper": (4096, 1024)}  # train, test
+EPOCHS = 5  # of ours and of the bare loop; the first is not counted
+PLAIN_EPOCHS = 4
+POLICY_FRAMES = {"laptop": (10_000, 2_500), "paper": (64_000, 16_000)}
+POLICY_BATCHES = {"laptop": 512, "paper": 2048}
+POLICY_EPOCHS = 5
+POLICY_ROUNDS = 3
 SEEDS = 15
-ROUNDS = 3
-EPOCHS = 5  # of each fit; the first is not counted
+CPU = torch.device("cpu")
+PACKAGES = ("lightning", "numpy", "torch")
+
+Numbers = dict[str, Any]
 
 
-class PlainPolicy(lightning.LightningModule):
-    """One policy as the paper's text reads."""
+def spread(values: Iterable[float]) -> Numbers:
+    """Median, lowest and highest."""
+    values = sorted(values)
+    return {"median": float(np.median(values)), "low": values[0], "high": values[-1], "n": len(values)}
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.networks = nn.ModuleDict()
-        for name, widths in WIDTHS.items():
-            layers: list[nn.Module] = []
-            for before, after in itertools.pairwise(widths):
-                layers += [nn.Linear(before, after), nn.ReLU(), nn.Dropout(DROPOUT)]
-            self.networks[name] = nn.Sequential(*layers[:-2])
-        self.ends: list[float] = []
 
-    def _losses(self, batch: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-        z, steering, acceleration = batch
-        logits = self.networks["acceleration"](z)
-        accuracy = (logits.argmax(1) == acceleration).float().mean()
-        error = functional.smooth_l1_loss(self.networks["steering"](z)[:, 0], steering)
-        return error, functional.cross_entropy(logits, acceleration), accuracy
+# --- the machine's limits -------------------------------------------------------------------------------------------
 
-    def training_step(self, batch: list[Tensor]) -> Tensor:
-        """One batch."""
-        error, surprise, accuracy = self._losses(batch)
-        self.log_dict({"steering_loss": error, "accuracy": accuracy}, on_epoch=True, on_step=False)
-        return error + surprise
 
-    def validation_step(self, batch: list[Tensor]) -> None:
-        """One batch of the test split."""
-        error, surprise, accuracy = self._losses(batch)
-        self.log_dict({"val_steering_loss": error, "val_cross_entropy": surprise, "val_accuracy": accuracy})
+def fastest(work: Callable[[], Any], times: int = 8) -> float:
+    """Seconds of the fastest of some calls."""
+    seconds = []
+    for _ in range(times):
+        begin = time.perf_counter()
+        work()
+        seconds.append(time.perf_counter() - begin)
+    return min(seconds)
 
-    def on_train_epoch_end(self) -> None:
-        """Note the time."""
-        self.ends.append(time.perf_counter())
 
-    def configure_optimizers(self) -> torch.optim.Optimizer:
-        """Adam."""
-        return torch.optim.Adam(self.parameters(), lr=5e-4)
+def peaks(side: int) -> Numbers:
+    """Multiplications a second in a square matrix product, and bytes a second read and written in a copy."""
+    found = {}
+    for name, kind in (("fp32", torch.float32), ("bf16", torch.bfloat16)):
+        one, other = torch.rand(side, side).to(kind), torch.rand(side, side).to(kind)
+        out = torch.empty_like(one)
+        found[f"{name}_multiplications_per_s"] = side**3 / fastest(lambda a=one, b=other, c=out: torch.mm(a, b, out=c))
+    source = torch.ones(side * side * 16)
+    target = torch.empty_like(source)
+    found["copy_bytes_per_s"] = 2 * source.nbytes / fastest(lambda: target.copy_(source))
+    return found
+
+
+def encoder_work(heads: str, size: int) -> tuple[int, int]:
+    """Multiplications and bytes of an image trained on, in numbers of `size` bytes.
+
+    Forward, and twice that backward but for the gradient of the image. Each layer's output is written and read once
+    forward; backward it is read again, and its gradient written and read.
+    """
+    sides = list(itertools.accumulate(CHANNELS, lambda side, _: (side - KERNEL) // 2 + 1, initial=IMAGE))
+    ways = list(itertools.pairwise((HEADS["rec"], *CHANNELS)))
+    each = [a * b * KERNEL**2 * side**2 for (a, b), side in zip(ways, sides[1:], strict=True)]
+    connected = CHANNELS[-1] * CORE**2 * LATENT
+    numbers = sum(after * side**2 for (_, after), side in zip(ways, sides[1:], strict=True))
+    multiplications = 3 * (sum(each) + connected) - each[0]
+    moved = 5 * numbers * size + IMAGE**2 * 3
+    for head in HEAD_SETS[heads]:
+        multiplications += 3 * (sum(each[1:]) + each[0] * HEADS[head] // HEADS["rec"] + connected)
+        moved += 5 * (numbers * size + HEADS[head] * IMAGE**2 * 4) + IMAGE**2 // 8
+    return multiplications, moved
+
+
+def policy_work() -> tuple[int, int]:
+    """Multiplications and bytes of a frame that one policy is trained on.
+
+    As above, but what one seed's step works on stays in a core's cache: z, order, labels and dropout bits come in.
+    """
+    multiplications = 0
+    for widths in WIDTHS.values():
+        products = [before * after for before, after in itertools.pairwise(widths)]
+        multiplications += 3 * sum(products) - products[0]
+    bits = sum(sum(widths[1:-1]) for widths in WIDTHS.values()) // 8
+    return multiplications, 2 * (LATENT * 4 + 8 + 12 + bits)
+
+
+def floor(work: tuple[int, int], precision: str, limits: Numbers) -> Numbers:
+    """Work of a unit, and units a second at the machine's limits."""
+    multiplications, moved = work
+    seconds = {
+        "multiplications": multiplications / limits[f"{precision}_multiplications_per_s"],
+        "bytes": moved / limits["copy_bytes_per_s"],
+    }
+    bound = max(seconds, key=lambda name: seconds[name])
+    return {"multiplications": multiplications, "bytes": moved, "bound": bound, "per_s": 1 / seconds[bound]}
+
+
+# --- encoder --------------------------------------------------------------------------------------------------------
+
+
+def random_frames(train: int, test: int, folder: Path | None = None) -> Frames:
+    """Frames of any content; mapped from files of zeros when there is a folder."""
+    rng = np.random.default_rng(0)
+    arrays = {}
+    for name, shape in SHAPES.items():
+        whole = (train + test, *shape)
+        if folder is None:
+            arrays[name] = rng.integers(0, 256, whole, np.uint8)
+        else:
+            np.lib.format.open_memmap(folder / name, mode="w+", dtype=np.uint8, shape=whole)
+            arrays[name] = np.load(folder / name, mmap_mode="r")
+    labels = pd.DataFrame({"train": np.arange(train + test) < train, "episode": np.arange(train + test) // 100})
+    return Frames(arrays["images"], arrays["masks"], labels)
+
+
+def bare_epochs(frames: Frames, heads: str, settings: EncoderSettings, precision: str) -> Iterator[float]:
+    """Seconds of one epoch after the other: a loop over tensors in memory, and nothing else."""
+    images, masks = torch.from_numpy(frames.images), torch.from_numpy(frames.masks)
+    train, test = (torch.from_numpy(frames.indices(split)) for split in ("train", "test"))
+    module = MultiHeadAutoencoder(heads, settings, 0)
+    optimizer = module.configure_optimizers()
+    while True:
+        begin = time.perf_counter()
+        total = torch.zeros(2, len(module.metrics))
+        with torch.autocast("cpu", torch.bfloat16, enabled=precision == "bf16"):
+            module.train()
+            for rows in train[torch.randperm(len(train))].split(settings.batch):
+                optimizer.zero_grad()
+                total[0] += module.gradients(images[rows], masks[rows], None)
+                optimizer.step()
+            module.eval()
+            with torch.inference_mode():
+                for rows in test.split(settings.batch):
+                    total[1] += module.losses(images[rows], masks[rows])
+        total.tolist()
+        yield time.perf_counter() - begin
+
+
+@contextmanager
+def timed_checkpoints() -> Iterator[list[float]]:
+    """Seconds of each checkpoint that is written meanwhile."""
+    seconds: list[float] = []
+    write = autoencoder._write_checkpoint  # noqa: SLF001 - only here its time can be told from the rest
+
+    def timed(*what: Any) -> None:
+        begin = time.perf_counter()
+        write(*what)
+        seconds.append(time.perf_counter() - begin)
+
+    autoencoder._write_checkpoint = timed  # noqa: SLF001
+    try:
+        yield seconds
+    finally:
+        autoencoder._write_checkpoint = write  # noqa: SLF001
+
+
+def turn_about(frames: Frames, heads: str, settings: EncoderSettings, precision: str) -> dict[str, list[float]]:
+    """Seconds an epoch of ours and of the bare loop, and the seconds of ours that went into telling of it."""
+    bare = bare_epochs(frames, heads, settings, precision)
+    next(bare)  # warms up
+    found: dict[str, list[float]] = {"ours": [], "bare": [], "telling": []}
+    here, there = multiprocessing.Pipe(duplex=False)
+    threading.Thread(target=lambda: [None for _ in iter(here.recv, None)], daemon=True).start()
+    begin = told = 0.0
+
+    def progress(done: int, whole: int) -> None:
+        nonlocal told
+        start = time.perf_counter()
+        there.send(("progress", "encoder", done, whole))
+        told += time.perf_counter() - start
+
+    def log(epoch: int, losses: dict[str, float]) -> None:
+        nonlocal begin, told
+        start = time.perf_counter()
+        there.send(("log", "encoder", epoch, losses))
+        told += time.perf_counter() - start
+        if epoch > 1:
+            found["ours"].append(time.perf_counter() - begin)
+            found["telling"].append(told)
+            found["bare"].append(next(bare))
+        told, begin = 0.0, time.perf_counter()
+
+    with tempfile.TemporaryDirectory() as folder, timed_checkpoints() as found["checkpoint"]:
+        train_encoder(
+            frames,
+            heads,
+            1.0,
+            0,
+            settings,
+            FramesSettings(),
+            device="cpu",
+            checkpoint=Path(folder) / "checkpoint",
+            log=log,
+            progress=progress,
+        )
+    there.send(None)
+    return found
+
+
+def encoder(heads: str, size: str, limits: Numbers) -> Numbers:
+    """One head set at one batch size: ours, the bare loop, the template in fp32 and in bf16."""
+    batch, (train, test) = BATCHES[size], FRAMES[size]
+    frames = random_frames(train, test)
+    precision = choose_precision("auto", CPU)
+    settings = EncoderSettings(batch=batch, epochs=EPOCHS)
+    steps = plan_training(frames, 1.0, 0, settings, FramesSettings()).steps
+    templates = {"template": plain.fit_encoder(frames, heads, batch, PLAIN_EPOCHS, "32-true")}
+    found = turn_about(frames, heads, settings, precision)
+    templates["template_bf16"] = plain.fit_encoder(frames, heads, batch, PLAIN_EPOCHS, "bf16-mixed")
+    rates = {name: [train / seconds for seconds in found[name]] for name in ("ours", "bare")}
+    rates |= {name: [train / seconds for seconds in epochs] for name, epochs in templates.items()}
+    pairs = [ours / bare for ours, bare in zip(rates["ours"], rates["bare"], strict=True)]
+    limit = floor(encoder_work(heads, 2 if precision == "bf16" else 4), precision, limits)
+    ours = spread(rates["ours"])
+    told = sum(found["telling"]) / sum(found["ours"])
+    return {
+        "heads": heads,
+        "batch": batch,
+        "frames": [train, test],
+        "steps": steps,
+        "precision": precision,
+        "images_per_s": {name: spread(values) for name, values in rates.items()},
+        "ratio_to_bare": spread(pairs),
+        **{f"ratio_to_{name}": ours["median"] / spread(rates[name])["median"] for name in templates},
+        "telling_share": told + float(np.median(found["checkpoint"])) / autoencoder.CHECKPOINT_SECONDS,
+        "checkpoint_s": spread(found["checkpoint"]),
+        "floor": limit | {"reached": ours["median"] / limit["per_s"]},
+    }
+
+
+# --- memory ---------------------------------------------------------------------------------------------------------
+
+
+def memory(precision: str) -> int:
+    """Highest memory of a process of its own that trains `full` at the paper's batch, beside mapped files [bytes]."""
+    program = [sys.executable, __file__, "--memory", precision]
+    return int(subprocess.run(program, check=True, capture_output=True, text=True).stdout)
+
+
+def train_for_memory(precision: str) -> None:
+    """Train `full` on two batches for two epochs, look at our own memory every 5 ms, print the highest."""
+    page, seen, done = os.sysconf("SC_PAGE_SIZE"), [0], threading.Event()
+
+    def look() -> None:
+        while not done.wait(0.005):
+            resident, shared = Path("/proc/self/statm").read_text().split()[1:3]  # shared: what is mapped from files
+            seen.append((int(resident) - int(shared)) * page)
+
+    watcher = threading.Thread(target=look)
+    watcher.start()
+    batch = BATCHES["paper"]
+    settings = EncoderSettings(batch=batch, epochs=2, lr=5e-3, precision=precision)  # type: ignore[arg-type]
+    with tempfile.TemporaryDirectory() as folder:
+        frames = random_frames(2 * batch, batch // 2, Path(folder))
+        train_encoder(
+            frames,
+            "full",
+            1.0,
+            0,
+            settings,
+            FramesSettings(),
+            device="cpu",
+            checkpoint=Path(folder) / "checkpoint",
+            log=lambda *_: None,
+        )
+    done.set()
+    watcher.join()
+    print(max(seen))
+
+
+# --- policies -------------------------------------------------------------------------------------------------------
 
 
 def latents(frames: int, seed: int) -> tuple[np.ndarray, pd.DataFrame]:
     """Latents and labels of the right kind."""
     rng = np.random.default_rng(seed)
-    z = rng.normal(size=(frames, 64)).astype(np.float32)
+    z = rng.normal(size=(frames, LATENT)).astype(np.float32)
     return z, pd.DataFrame({"steering": np.tanh(z[:, 0]) / 4, "acceleration": np.digitize(z[:, 1], [-0.5, 0.5])})
 
 
-def stacked_epochs(train: Any, test: Any, batch: int) -> list[float]:
-    """Seconds of each epoch of all seeds, measuring included."""
+def stacked_epochs(train: plain.Labelled, test: plain.Labelled, batch: int) -> list[float]:
+    """Seconds of each epoch of all seeds but the first, measuring included."""
     ends: list[float] = []
+    settings = PolicySettings(epochs=POLICY_EPOCHS, batch=batch)
     train_policies(
         train[0],
         test[0],
         train[1],
         test[1],
         range(SEEDS),
-        PolicySettings(epochs=EPOCHS, batch=batch),
+        settings,
         log=lambda *_: ends.append(time.perf_counter()),
     )
     return list(np.diff(ends))
 
 
-def plain_epochs(train: Any, test: Any, batch: int) -> list[float]:
-    """Seconds of each epoch of one plain fit, validation included."""
-    sets = [
-        TensorDataset(
-            torch.from_numpy(z),
-            torch.tensor(labels["steering"].to_numpy(np.float32)),
-            torch.tensor(labels["acceleration"].to_numpy(np.int64)),
-        )
-        for z, labels in (train, test)
-    ]
-    policy = PlainPolicy()
-    trainer = lightning.Trainer(
-        accelerator="cpu",
-        max_epochs=EPOCHS,
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        num_sanity_val_steps=0,
-    )
-    trainer.fit(policy, DataLoader(sets[0], batch, shuffle=True), DataLoader(sets[1], batch))
-    return list(np.diff(policy.ends))
+def policies(size: str, limits: Numbers) -> Numbers:
+    """Seconds an epoch of 15 policies, stacked and one after the other, and how many times faster the stack is.
 
-
-def spread(values: Iterable[float]) -> dict[str, float]:
-    """Median, lowest and highest."""
-    values = sorted(values)
-    return {"median": float(np.median(values)), "low": values[0], "high": values[-1], "n": len(values)}
-
-
-def policies(size: str) -> dict[str, Any]:
-    """Seconds an epoch of 15 policies, stacked and one after the other, and how many times faster the stack is."""
-    frames, tests, batch = SIZES[size]
+    The plain fit is measured with torch's threads as they come, and with one: small products gain little from two.
+    """
+    (frames, tests), batch = POLICY_FRAMES[size], POLICY_BATCHES[size]
     train, test = latents(frames, 0), latents(tests, 1)
-    ours, theirs, ratios = [], [], []
-    for _ in range(ROUNDS):
-        before = plain_epochs(train, test, batch)
+    threads = torch.get_num_threads()
+    seconds: dict[str, list[float]] = {"ours": [], "sequential": [], "sequential_one_thread": []}
+    ratios = []
+    for _ in range(POLICY_ROUNDS):
+        plain_epochs = [SEEDS * epoch for epoch in plain.fit_policy(train, test, batch, POLICY_EPOCHS)]
         stack = stacked_epochs(train, test, batch)
-        after = plain_epochs(train, test, batch)
-        ours += stack
-        theirs += [SEEDS * seconds for seconds in before + after]
-        ratios.append(SEEDS * float(np.median(before + after)) / float(np.median(stack)))
+        torch.set_num_threads(1)
+        one_thread = [SEEDS * epoch for epoch in plain.fit_policy(train, test, batch, POLICY_EPOCHS)]
+        torch.set_num_threads(threads)
+        ratios.append(float(np.median(plain_epochs) / np.median(stack)))
+        for name, values in zip(seconds, (stack, plain_epochs, one_thread), strict=True):
+            seconds[name] += values
+    limit = floor(policy_work(), "fp32", limits)
+    evaluated = 2 * tests * sum(a * b for widths in WIDTHS.values() for a, b in itertools.pairwise(widths))
+    epoch = SEEDS * (frames / limit["per_s"] + evaluated / limits["fp32_multiplications_per_s"])
+    ours, one_thread_median = (spread(seconds[name])["median"] for name in ("ours", "sequential_one_thread"))
     return {
         "frames": [frames, tests],
         "batch": batch,
         "seeds": SEEDS,
-        "seconds_per_epoch": spread(ours),
-        "seconds_per_epoch_sequential": spread(theirs),
-        "ratio_to_sequential": spread(ratios)["median"],
-        "ratio_spread": spread(ratios),
+        "seconds_per_epoch": {name: spread(values) for name, values in seconds.items()},
+        "ratio_to_sequential": spread(ratios),
+        "ratio_to_sequential_one_thread": one_thread_median / ours,
+        "floor": limit | {"seconds_per_epoch": epoch, "reached": epoch / ours},
     }
+
+
+# --- main -----------------------------------------------------------------------------------------------------------
+
+
+def machine() -> Numbers:
+    """What measured."""
+    made_by = provenance()
+    return {
+        "cpu": made_by["cpu"],
+        "cores": made_by["cores"],
+        "threads": torch.get_num_threads(),
+        "platform": made_by["platform"],
+        "python": made_by["python"],
+        "packages": {name: made_by["packages"].get(name) for name in PACKAGES},
+        "commit": made_by["commit"],
+        "load_before": os.getloadavg()[0],
+    }
+
+
+def show(result: Numbers) -> None:
+    """Print the tables of `benchmarks/README.md`."""
+
+    def cell(numbers: Numbers) -> str:
+        return f"{numbers['median']:,.0f} ({numbers['low']:,.0f} to {numbers['high']:,.0f})"
+
+    print("\n| heads, batch | ours | bare loop | template | template bf16 | to bare | to templates | floor | reached |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    for each in result["encoder"]["configurations"]:
+        rates = (cell(numbers) for numbers in each["images_per_s"].values())
+        limit, pairs = each["floor"], each["ratio_to_bare"]
+        print(
+            f"| `{each['heads']}`, {each['batch']} | {' | '.join(rates)} "
+            f"| {pairs['median']:.3f} ({pairs['low']:.3f} to {pairs['high']:.3f}) "
+            f"| {each['ratio_to_template']:.2f} / {each['ratio_to_template_bf16']:.2f} "
+            f"| {limit['per_s']:,.0f} ({limit['bound']}) | {100 * limit['reached']:.0f} % |"
+        )
+    print("\n| policies | ours | 15 fits | 15 fits, one thread | ratio | floor | reached |")
+    print("|---|---|---|---|---|---|---|")
+    for size in POLICY_FRAMES:
+        each = result["policies"][size]
+        seconds = (f"{n['median']:.2f} ({n['low']:.2f} to {n['high']:.2f})" for n in each["seconds_per_epoch"].values())
+        ratio = each["ratio_to_sequential"]
+        print(
+            f"| {size}, batch {each['batch']} | {' | '.join(seconds)} "
+            f"| {ratio['median']:.1f} ({ratio['low']:.1f} to {ratio['high']:.1f}) "
+            f"/ {each['ratio_to_sequential_one_thread']:.1f} "
+            f"| {each['floor']['seconds_per_epoch']:.2f} | {100 * each['floor']['reached']:.0f} % |"
+        )
+    shown = ("machine", "limits", "memory_bytes")
+    print(json.dumps({name: result[name] for name in shown}, indent=1))
+    print(f"telling and checkpoints: {100 * result['encoder']['telling_share']:.2f} % at most")
 
 
 def main() -> None:
     """Measure, print, and keep the result."""
-    warnings.simplefilter("ignore")
-    logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
-    size = sys.argv[1] if len(sys.argv) > 1 else "laptop"
-    result = json.loads(RESULT.read_text()) if RESULT.exists() else {"encoder": None, "policies": None, "gpu": None}
-    result["machine"] = {"cores": torch.get_num_threads(), "processor": platform.processor() or platform.machine()}
-    measured = policies(size)
-    print(json.dumps(measured, indent=1))
-    sizes = (result["policies"] or {}) | {size: measured}
-    ratios = [sizes[name]["ratio_to_sequential"] for name in SIZES if name in sizes]
-    result["policies"] = sizes | {"ratio_to_sequential": min(ratios)}
-    RESULT.parent.mkdir(exist_ok=True)
-    RESULT.write_text(json.dumps(result, indent=1) + "\n")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="try everything on almost no data; keep nothing")
+    parser.add_argument("--memory", metavar="PRECISION", help="measure the memory of training, as the others do")
+    options = parser.parse_args()
+    if options.memory:
+        train_for_memory(options.memory)
+        return
+    if options.quick:
+        BATCHES.update(laptop=16, paper=64)
+        FRAMES.update(laptop=(64, 16), paper=(128, 32))
+        POLICY_FRAMES.update(laptop=(1000, 250), paper=(2048, 500))
+    result: Numbers = {"machine": machine(), "limits": peaks(256 if options.quick else 2048)}
+    encoders = [encoder(heads, size, result["limits"]) for size in BATCHES for heads in ("rec", "full")]
+    result["encoder"] = {
+        "images_per_s": encoders[-1]["images_per_s"]["ours"]["median"],  # `full` at the paper's batch
+        "ratio_to_bare": min(each["ratio_to_bare"]["median"] for each in encoders),
+        "ratio_to_template": min(each["ratio_to_template"] for each in encoders),
+        "telling_share": max(each["telling_share"] for each in encoders),
+        "configurations": encoders,
+    }
+    sizes = {size: policies(size, result["limits"]) for size in POLICY_FRAMES}
+    worst = min(each["ratio_to_sequential"]["median"] for each in sizes.values())
+    result["policies"] = {"ratio_to_sequential": worst, **sizes}
+    result["memory_bytes"] = {precision: memory(precision) for precision in ("bf16", "fp32")}
+    result["gpu"] = None  # not measured yet
+    show(result)
+    if not options.quick:
+        RESULT.write_text(json.dumps(result, indent=1) + "\n")
 
 
 if __name__ == "__main__":

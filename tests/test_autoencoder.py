@@ -373,15 +373,15 @@ def assert_same_step(frames: Frames, heads: str, beta: float, tolerance: float) 
         elif theirs.grad.norm() > 2e-4:  # a bias before a BatchNorm has none but rounding
             assert (ours.grad - theirs.grad).norm() <= tolerance * theirs.grad.norm(), name
     for (name, ours), theirs in zip(fused.named_buffers(), eager.buffers(), strict=True):
-        assert torch.allclose(ours, theirs, rtol=1e-3 * tolerance, atol=1e-6), name
+        assert (ours - theirs).double().norm() <= tolerance * theirs.double().norm() / 10, name
 
 
 @pytest.mark.slow
 def test_a_compiled_step_is_the_step_head_by_head(frames: Frames, recwarn: pytest.WarningsRecorder) -> None:
-    """Stated tolerance, in float32: 3e-5 of each loss, 3 % of each gradient's norm.
+    """Stated tolerance, in float32: 3e-5 of each loss, 0.3 % of BatchNorm's statistics, 3 % of each gradient's norm.
 
     With fresh weights the gradients behind a BatchNorm are small differences of large sums: head by head, float32 is
-    itself 1 to 3 % away from float64.
+    itself up to 3 % away from float64.
     """
     assert_same_step(frames, "rec+plan", 0.3, 0.03)
     assert not [warning for warning in recwarn if "torch.compile failed" in str(warning.message)]
