@@ -16,14 +16,15 @@ import pandas as pd
 import torch
 from numpy.typing import NDArray
 
-from study.autoencoder import check_device, encode, train_encoder
-from study.config import BadInputError, cell_key, encoder_key
-from study.frames import Frames, open_frames
+from study.autoencoder import TrainedEncoder, check_device, encode, train_encoder
+from study.config import CEILING, BadInputError, cell_key, encoder_key
+from study.frames import Frames, FrameStore, open_frames
 from study.policy import train_policies
 from study.provenance import provenance
 from study.result import NO_SEED, CellJob, CellResult
+from study.state import true_state
 
-STATE = ("speed", "light", "lead_gap")  # columns of the labels that reports probe the latents for
+PROBED = ("speed", "light", "lead_gap")  # columns of the labels that reports probe the latents for
 
 Log = Callable[[str, int, dict[str, float]], None]
 Progress = Callable[[str, int, int], None]
@@ -31,6 +32,8 @@ Progress = Callable[[str, int, int], None]
 
 def run_cell(job: CellJob, log: Log, progress: Progress) -> CellResult:
     """Train the cell's encoder, encode the policy set once, train all policies, and save the result.
+
+    The ceiling has no encoder: its latents are the true state.
 
     `log(stage, epoch, metrics)` once an epoch with names such as "test/loss_rec"; `progress(stage, done, total)`.
     Raises BadInputError for settings that cannot be met, TrainingDivergedError for a loss that is not finite.
@@ -47,24 +50,16 @@ def run_cell(job: CellJob, log: Log, progress: Progress) -> CellResult:
     origin = provenance() | {"determinism": determinism(), "seeds": _seeds(job)}
 
     started = time.perf_counter()
-    encoder = train_encoder(
-        store.encoder,
-        cell.heads,
-        cell.fraction,
-        cell.encoder_seed,
-        settings.encoder,
-        settings.frames,
-        device=device,
-        checkpoint=job.scratch / "encoders" / encoder_key(settings, cell, store.key),
-        log=lambda epoch, metrics: log("encoder", epoch, metrics),
-        progress=lambda done, whole: progress("encoder", done, whole),
-    )
-    trained = time.perf_counter()
-
     train, test = _labelled(store.policy, "train"), _labelled(store.policy, "test")
-    z_train, z_test = (
-        encode(encoder.weights, store.policy.images, indices, device=device) for indices, _ in (train, test)
-    )
+    encoder = _NO_ENCODER if cell.heads == CEILING else _train_encoder(job, store, device, log, progress)
+    trained = time.perf_counter()
+    if cell.heads == CEILING:
+        state = true_state(store.policy.labels, store.manifest["sources"]["policy"], job.drives)
+        z_train, z_test = (state[indices] for indices, _ in (train, test))
+    else:
+        z_train, z_test = (
+            encode(encoder.weights, store.policy.images, indices, device=device) for indices, _ in (train, test)
+        )
     encoded = time.perf_counter()
 
     policies = train_policies(
@@ -97,7 +92,7 @@ def run_cell(job: CellJob, log: Log, progress: Progress) -> CellResult:
             "acceleration_label": labels["acceleration"].to_numpy(np.uint8),
             "steering_label": labels["steering"].to_numpy(np.float32),
             "episode": labels["episode"].to_numpy(np.int32),
-            **{name: labels[name].to_numpy() for name in STATE},
+            **{name: labels[name].to_numpy() for name in PROBED},
             "z": z_test,
         },
         facts={
@@ -146,6 +141,25 @@ def _seeds(job: CellJob) -> dict[str, Any]:
         "encoder": job.cell.encoder_seed,
         "policies": list(range(job.policy_seeds)),
     }
+
+
+_NO_ENCODER = TrainedEncoder({}, pd.DataFrame(columns=["split", "epoch", "metric", "value"]), {}, 0, 0.0, "fp32")
+
+
+def _train_encoder(job: CellJob, store: FrameStore, device: str, log: Log, progress: Progress) -> TrainedEncoder:
+    settings, cell = job.settings, job.cell
+    return train_encoder(
+        store.encoder,
+        cell.heads,
+        cell.fraction,
+        cell.encoder_seed,
+        settings.encoder,
+        settings.frames,
+        device=device,
+        checkpoint=job.scratch / "encoders" / encoder_key(settings, cell, store.key),
+        log=lambda epoch, metrics: log("encoder", epoch, metrics),
+        progress=lambda done, whole: progress("encoder", done, whole),
+    )
 
 
 def choose_device(job: CellJob) -> str:

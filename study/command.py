@@ -28,7 +28,7 @@ WRITE_ERRORS = (
     *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG),
     *(errno.EACCES, errno.EROFS, errno.ENOTDIR, errno.EEXIST),
 )
-GRID_OPTIONS = ("heads", "fractions", "encoder_seeds", "policy_seeds", "baseline")
+GRID_OPTIONS = ("heads", "fractions", "encoder_seeds", "policy_seeds", "baseline", "ceiling")
 
 
 class Parser(argparse.ArgumentParser):

@@ -36,6 +36,7 @@ HEAD_SETS: dict[str, tuple[str, ...]] = {
     "rec+plan": ("rec", "plan"),
     "full": ("rec", "pred", "plan"),
 }
+CEILING = "state"  # in the place of a head set: a cell without encoder, whose policies are given the true state
 
 
 class BadInputError(Exception):
@@ -218,6 +219,7 @@ class Grid(Settings):
     encoder_seeds: Count = Field(1, description="encoders for each head set and fraction")
     policy_seeds: Count = Field(15, description="policies on each encoder (Sec. V-A: 15)")
     baseline: str = Field("rec", description="head set that the others are compared with")
+    ceiling: bool = Field(default=True, description="one more cell: policies on the true state, as a ceiling")
     claims: tuple[str, ...] = Field((), description="claims of the paper that this sweep tests")
     rules: Rules = Field(Rules(), description="when a claim counts as reproduced")
 
@@ -233,12 +235,15 @@ class Grid(Settings):
         return self
 
     def cells(self) -> list[Cell]:
-        """The grid's cells, in the order they are worth running: one encoder seed of everything first."""
+        """The cells in the order they are worth running: one encoder seed of everything first, the ceiling last."""
         return [
-            Cell(heads=heads, fraction=fraction, encoder_seed=seed)
-            for seed in range(self.encoder_seeds)
-            for fraction in self.fractions
-            for heads in self.heads
+            *(
+                Cell(heads=heads, fraction=fraction, encoder_seed=seed)
+                for seed in range(self.encoder_seeds)
+                for fraction in self.fractions
+                for heads in self.heads
+            ),
+            *[Cell(heads=CEILING)] * self.ceiling,
         ]
 
 
@@ -252,6 +257,8 @@ class Cell(Settings):
     @property
     def label(self) -> str:
         """Name for people, e.g. `rec+plan 100% e0`."""
+        if self.heads == CEILING:
+            return f"{CEILING} (ceiling)"
         return f"{self.heads} {self.fraction * 100:g}% e{self.encoder_seed}"
 
 
@@ -271,7 +278,7 @@ def content_key(stage: str, settings: object, inputs: tuple[str, ...], format_ve
 
 
 # Raised on purpose when a stage's code changes what it makes; a test holds each product's digest.
-FORMAT_VERSIONS = {"episodes": 1, "frames": 1, "encoder": 1, "cell": 1}
+FORMAT_VERSIONS = {"episodes": 1, "frames": 1, "encoder": 1, "state": 1, "cell": 1}
 
 
 def recording_key(settings: StudySettings) -> str:
@@ -304,6 +311,8 @@ def frames_key(settings: StudySettings, source: str | None = None) -> str:
 
 def encoder_key(settings: StudySettings, cell: Cell, frames: str) -> str:
     """Key of a trained encoder. What makes no difference at the full data is left out there."""
+    if cell.heads == CEILING:
+        return content_key("state", {}, (frames,), FORMAT_VERSIONS["state"])
     own: dict[str, Any] = {
         "encoder": settings.encoder.model_dump(mode="json", exclude={"budget", "head_weights"}),
         "heads": {head: settings.encoder.head_weights.get(head, 1.0) for head in HEAD_SETS[cell.heads]},

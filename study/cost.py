@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from study.config import HEAD_SETS, IMAGE, Cell, StudySettings
+from study.config import CEILING, HEAD_SETS, IMAGE, Cell, StudySettings
 
 STEP_HZ = 10
 VEHICLE_FRAMES_PER_S = 90_000.0  # simulated, on two cores
@@ -17,6 +17,7 @@ ENCODER_IMAGE_S = 1 / 3700  # an image forward and backward through the encoder
 HEAD_IMAGE_S = 1 / 3800  # the same for each head
 TEST_COST = 0.35  # an image evaluated, as a share of an image trained
 POLICY_FRAME_S = 1 / 280_000  # a frame forward and backward through one policy
+DRIVE_READ_S = 0.12  # a drive read again for the true state
 CELL_START_S = 10.0  # a process starts, imports torch and opens the data; a result is committed
 
 FRAME_BYTES = IMAGE * IMAGE * 3 + 2 * IMAGE * IMAGE // 8 + 40  # image, two bit masks, labels
@@ -50,15 +51,17 @@ def data_cost(settings: StudySettings, *, recorded: bool = True) -> Cost:
 
 
 def cell_cost(settings: StudySettings, cell: Cell, policy_seeds: int) -> Cost:
-    """Of one cell: its encoder and its policies."""
+    """Of one cell: its encoder, unless it is the ceiling, and its policies."""
     frames, encoder, policy = settings.frames, settings.encoder, settings.policy
+    policies = policy_seeds * policy.epochs * frames.policy * POLICY_FRAME_S + CELL_START_S
+    if cell.heads == CEILING:
+        return Cost(policies + settings.recording.policy_episodes * DRIVE_READ_S, RESULT_BYTES)
     train = frames.encoder * (1 - frames.test_share)
     if encoder.budget == "epochs":
         train *= cell.fraction
     images = encoder.epochs * (train + TEST_COST * frames.encoder * frames.test_share)
     seconds = images * (ENCODER_IMAGE_S + HEAD_IMAGE_S * len(HEAD_SETS[cell.heads]))
-    seconds += policy_seeds * policy.epochs * frames.policy * POLICY_FRAME_S
-    return Cost(seconds + CELL_START_S, RESULT_BYTES)
+    return Cost(seconds + policies, RESULT_BYTES)
 
 
 def total(costs: Iterable[Cost]) -> Cost:

@@ -7,6 +7,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from study import claims, figures, stats
+from study.config import CEILING
 from study.figures import Drawing
 from study.result import CellResult, SweepRecord
 from study.summary import Numbers
@@ -16,7 +17,7 @@ HEAD_WORDS = {"rec": "reconstruction", "pred": "prediction", "plan": "planning"}
 
 def draw(record: SweepRecord, made: Numbers) -> list[Drawing]:
     """The figures that the finished cells allow (PAPER.md section 4), each with a caption that says n and kind."""
-    if not record.results:
+    if not made["scores"]:
         return []
     if len(record.grid.fractions) > 1:
         own = [*_speed(record, made), *_fractions(made)]
@@ -49,11 +50,25 @@ def _heads(record: SweepRecord, made: Numbers, split: str, place: str) -> Drawin
         f"{split}_compare_heads",
         place,
         f"Policies on frozen encoders by epoch, {split} split: (a) steering loss, (b) acceleration accuracy, for "
-        f"encoders trained with {names}. {_bands(made)} Where the accuracy axis is cut, it says so. "
-        f"The paper's fig:{split}_compare_heads.",
+        f"encoders trained with {names}. {_bands(made)}{_ceiling_words(made)} Where the accuracy axis is cut, it says "
+        f"so. The paper's fig:{split}_compare_heads.",
         f"Two line charts of steering loss and acceleration accuracy by epoch on the {split} split. On test {alt}.",
-        figures.compare_heads(steering, accuracy, floor["steering"], floor["accuracy"], split),
+        figures.compare_heads(steering, accuracy, floor["steering"], floor["accuracy"], split, _ceiling(record, split)),
     )
+
+
+def _ceiling(record: SweepRecord, split: str = "test") -> pd.DataFrame | None:
+    """Accuracy of policies on the true state by epoch."""
+    if record.ceiling is None:
+        return None
+    table = record.table(ceiling=True)
+    return stats.curve_bands(table[table["heads"] == CEILING], stats.ACCURACY, split)
+
+
+def _ceiling_words(made: Numbers) -> str:
+    if made["ceiling"] is None:
+        return ""
+    return f" Dotted, true state: mean over n = {made['ceiling']['n']} policies that need no encoder, the ceiling."
 
 
 def _speed(record: SweepRecord, made: Numbers) -> list[Drawing]:
@@ -70,11 +85,11 @@ def _speed(record: SweepRecord, made: Numbers) -> list[Drawing]:
             "datasize_convergespeed",
             "main",
             f"Test acceleration accuracy by policy epoch: full at every data fraction against {base} at the largest. "
-            f"{_bands(made)} Dotted: {base}'s final accuracy (mean of its last {stats.LAST} epochs) and the epoch at "
-            "which each mean curve first reaches it. Where the axis is cut, it says so. The paper's "
-            "fig:datasize_convergespeed.",
+            f"{_bands(made)}{_ceiling_words(made)} Fine dots: {base}'s final accuracy (mean of its last {stats.LAST} "
+            "epochs) and the epoch at which each mean curve first reaches it. Where the axis is cut, it says so. "
+            "The paper's fig:datasize_convergespeed.",
             f"Line chart. Epoch at which full reaches {base}'s final accuracy, by fraction: {told}.",
-            figures.converge_speed(bands, base, reached, floor),
+            figures.converge_speed(bands, base, reached, floor, _ceiling(record)),
         )
     ]
 
@@ -94,13 +109,14 @@ def _fractions(made: Numbers) -> list[Drawing]:
             "fractions",
             f"Test (a) steering loss and (b) acceleration accuracy, mean of the last {stats.LAST} epochs, by share of "
             f"the encoder's training data. Thin bar: one standard deviation over {_over(made)}; thick bar: 95 % "
-            f"interval of the mean ({kind}). Where the accuracy axis is cut, it says so. The paper's "
-            "fig:datasize_compare.",
+            f"interval of the mean ({kind}).{_ceiling_words(made)} Where the accuracy axis is cut, it says so. "
+            "The paper's fig:datasize_compare.",
             f"Two dot plots by data fraction. Accuracy: {told}.",
             figures.compare_fractions(
                 pd.DataFrame(rows).astype({"sd": float, "low": float, "high": float}),
                 made["floor"]["steering"],
                 made["floor"]["accuracy"],
+                made["ceiling"] and made["ceiling"]["mean"],
             ),
         )
     ]

@@ -29,6 +29,7 @@ FRACTION_COLOUR = ("#D55E00", "#E69F00", "#009E73", "#56B4E9", "#CC79A7")
 FRACTION_MARKER = ("D", "^", "s", "v", "P")
 CLASS_COLOUR = ("#0072B2", "#E69F00", "#009E73")  # of the acceleration classes
 GREY = "#666666"
+CEILING_LINE, CEILING_WORDS = ":", "true state"
 WIDTH = 6.4  # [in], the report's text width
 LATE = 0.05  # share of the epochs after which the axis of a curve shows everything
 STYLE: dict[Any, Any] = {
@@ -101,11 +102,12 @@ def compare_heads(
     steering_floor: float,
     accuracy_floor: float,
     split: str = "test",
+    ceiling: pd.DataFrame | None = None,
 ) -> Figure:
     """Steering loss and acceleration accuracy by epoch (fig:test_compare_heads, fig:train_compare_heads).
 
-    Both tables are those of `study.stats.curve_bands` at one fraction: mean line, band of one standard deviation over
-    seeds, darker band for the 95 % interval of the mean.
+    All tables are those of `study.stats.curve_bands` at one fraction: mean line, band of one standard deviation over
+    seeds, darker band for the 95 % interval of the mean. `ceiling`: accuracy of policies on the true state.
     """
     with mpl.rc_context(STYLE):
         figure, (left, right) = _figure(2.6, columns=2)
@@ -116,21 +118,26 @@ def compare_heads(
         left.set_title(f"(a) Steering loss, {split}")
         _loss_axis(left, steering, steering_floor)
         right.set_title(f"(b) Acceleration accuracy, {split}")
-        _accuracy_axis(right, accuracy, accuracy_floor)
+        _accuracy_axis(right, accuracy, accuracy_floor, _top(ceiling))
         for axes, bands, scale in ((left, steering, 1000.0), (right, accuracy, 100.0)):
             last = bands[bands["epoch"] == bands["epoch"].max()]
-            ends = zip(last["mean"] * scale, last["heads"], strict=True)
-            _label_ends(axes, [(float(value), str(heads), COLOUR[str(heads)]) for value, heads in ends])
+            values = zip(last["mean"] * scale, last["heads"], strict=True)
+            ends = [(float(value), str(heads), COLOUR[str(heads)]) for value, heads in values]
+            _label_ends(axes, ends + (_ceiling(axes, ceiling) if axes is right else []))
     return figure
 
 
 def converge_speed(
-    accuracy: pd.DataFrame, baseline: str, reached: Mapping[float, float], accuracy_floor: float
+    accuracy: pd.DataFrame,
+    baseline: str,
+    reached: Mapping[float, float],
+    accuracy_floor: float,
+    ceiling: pd.DataFrame | None = None,
 ) -> Figure:
     """Test accuracy by epoch: full at every fraction against the baseline at the largest (fig:datasize_convergespeed).
 
-    `accuracy`: `study.stats.curve_bands`; `reached`: fraction -> epoch at which full's mean curve reaches the
-    baseline's final accuracy, infinite when never.
+    `accuracy`, `ceiling`: `study.stats.curve_bands`; `reached`: fraction -> epoch at which full's mean curve reaches
+    the baseline's final accuracy, infinite when never.
     """
     with mpl.rc_context(STYLE):
         figure, (axes,) = _figure(3.4)
@@ -145,7 +152,7 @@ def converge_speed(
         _curve(axes, base, 100.0, COLOUR[baseline], "--", MARKER[baseline], 0)
         ends.append((100 * float(base["mean"].iloc[-1]), f"{baseline}, {_percent(top)}", COLOUR[baseline]))
         shown = pd.concat([others, base])
-        _accuracy_axis(axes, shown, accuracy_floor)
+        _accuracy_axis(axes, shown, accuracy_floor, _top(ceiling))
         goal = 100 * float(base["mean"].iloc[-5:].mean())
         axes.axhline(goal, color=GREY, linewidth=0.6, linestyle=":")
         for index, fraction in enumerate(others["fraction"].unique()):
@@ -155,7 +162,7 @@ def converge_speed(
                 axes.plot([epoch, epoch], [axes.get_ylim()[0], goal], color=colour, linewidth=0.6, linestyle=":")
         axes.set_xlabel("policy epoch")
         axes.set_ylabel("acceleration accuracy, test [%]")
-        _label_ends(axes, ends)
+        _label_ends(axes, ends + _ceiling(axes, ceiling))
     return figure
 
 
@@ -188,11 +195,26 @@ def _loss_axis(axes: Axes, bands: pd.DataFrame, floor: float) -> None:
         _note(axes, 0.97, f"best constant command, above: {floor:.2f}")
 
 
-def _accuracy_axis(axes: Axes, bands: pd.DataFrame, floor: float) -> None:
-    """Cut below the curves, and says so: the majority class's accuracy is named where it is not in sight."""
+def _top(ceiling: pd.DataFrame | None) -> float:
+    return 0.0 if ceiling is None else float(ceiling["mean"].max())
+
+
+def _ceiling(axes: Axes, bands: pd.DataFrame | None) -> list[tuple[float, str, str]]:
+    """Draw the curve of the true state, without a band, and return the label for its end."""
+    if bands is None:
+        return []
+    axes.plot(bands["epoch"], 100 * bands["mean"], CEILING_LINE, color=GREY, linewidth=0.8)
+    return [(100 * float(bands["mean"].iloc[-1]), CEILING_WORDS, GREY)]
+
+
+def _accuracy_axis(axes: Axes, bands: pd.DataFrame, floor: float, top: float) -> None:
+    """Cut below the curves, and says so: the majority class's accuracy is named where it is not in sight.
+
+    It reaches up to `top`, the ceiling, at least.
+    """
     part = _settled(bands)
     low = 100 * float((part["mean"] - part["sd"].fillna(0)).min())
-    high = 100 * float((part["mean"] + part["sd"].fillna(0)).max())
+    high = 100 * max(float((part["mean"] + part["sd"].fillna(0)).max()), top)
     pad = 0.06 * (high - low)
     low, high = max(low - 2 * pad, 0), min(high + pad, 100)
     axes.set_ylim(low, high)
@@ -244,11 +266,14 @@ def _percent(fraction: object) -> str:
 # --- by data fraction -----------------------------------------------------------------------------------------------
 
 
-def compare_fractions(scores: pd.DataFrame, steering_floor: float, accuracy_floor: float) -> Figure:
+def compare_fractions(
+    scores: pd.DataFrame, steering_floor: float, accuracy_floor: float, ceiling: float | None = None
+) -> Figure:
     """Mean of the last five epochs by data fraction (fig:datasize_compare).
 
     `scores`: one row for each cell and metric, columns metric (steering_loss, acceleration_accuracy), heads, fraction,
-    mean, sd, low, high. Thin bar: one standard deviation over seeds; thick bar: 95 % interval of the mean.
+    mean, sd, low, high. Thin bar: one standard deviation over seeds; thick bar: 95 % interval of the mean. `ceiling`:
+    accuracy of policies on the true state.
     """
     with mpl.rc_context(STYLE):
         figure, panels = _figure(2.6, columns=2)
@@ -273,7 +298,10 @@ def compare_fractions(scores: pd.DataFrame, steering_floor: float, accuracy_floo
             if metric == "steering_loss":
                 _loss_axis(axes, bands, steering_floor)
             else:
-                _accuracy_axis(axes, bands, accuracy_floor)
+                _accuracy_axis(axes, bands, accuracy_floor, ceiling or 0.0)
+                if ceiling:
+                    axes.axhline(100 * ceiling, color=GREY, linewidth=0.8, linestyle=CEILING_LINE)
+                    ends.append((100 * ceiling, CEILING_WORDS, GREY))
             _label_ends(axes, ends)
     return figure
 

@@ -22,7 +22,7 @@ from study.config import (
     named_files,
 )
 from study.cost import Cost, data_cost
-from study.data import DATA, frames_folder
+from study.data import DATA, drives_folder, frames_folder
 from study.imported import Imported, open_import
 from study.provenance import usual_threads
 
@@ -44,6 +44,11 @@ class Plan:
     def frames(self) -> Path:
         """Where the frame store lies, or will lie."""
         return frames_folder(self.settings, DATA, self.imported)
+
+    @property
+    def drives(self) -> Path:
+        """Where the drives behind it lie, or will lie."""
+        return drives_folder(self.settings, DATA, self.imported)
 
     @property
     def data_cost(self) -> Cost:

@@ -49,7 +49,7 @@ def build_report(record: SweepRecord, folder: Path = Path("reports")) -> Path:
     text = json.dumps(made, indent=1, ensure_ascii=False, allow_nan=False).encode()
     _write(own / "report.json", text)
     draft = own / ".curves.parquet"
-    record.table().to_parquet(draft, index=False)
+    record.table(ceiling=True).to_parquet(draft, index=False)
     draft.replace(own / "curves.parquet")
     pdf = folder / f"{record.grid.name}.pdf"
     _write(pdf, typeset(text, {name: content for name, content in pictures.items() if content}))

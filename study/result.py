@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save
 
-from study.config import BadInputError, Cell, Grid, StudySettings, cell_key
+from study.config import CEILING, BadInputError, Cell, Grid, StudySettings, cell_key
 
 FORMAT_VERSION = 1
 CURVE_COLUMNS = ("policy_seed", "stage", "split", "epoch", "metric", "value")
@@ -38,8 +38,9 @@ class TrainingDivergedError(RuntimeError):
 class CellJob:
     """All that a worker needs to know to train a cell.
 
-    `frames` is the frame store's folder; under `scratch` lies what a killed worker goes on from. `device` is "auto" or
-    a torch device; a worker with `slot` k takes the k-th GPU when there are several.
+    `frames` is the frame store's folder, `drives` that of the drives it was made from; under `scratch` lies what a
+    killed worker goes on from. `device` is "auto" or a torch device; a worker with `slot` k takes the k-th GPU when
+    there are several.
     """
 
     cell: Cell
@@ -47,6 +48,7 @@ class CellJob:
     settings: StudySettings
     policy_seeds: int
     frames: Path
+    drives: Path
     scratch: Path
     device: str = "auto"
     threads: int = 1
@@ -61,6 +63,8 @@ class CellJob:
 @dataclass(frozen=True)
 class CellResult:
     """One trained encoder and the policies on it. S policy seeds, N test frames of the policy set, K sample frames.
+
+    The ceiling, policies on the true state, has neither an encoder nor samples nor curves of an encoder.
 
     `curves`: one row per measured point, columns CURVE_COLUMNS; stage "encoder" (metrics loss, loss_rec, loss_pred,
     loss_plan, loss_kl; policy_seed is NO_SEED) or "policy" (steering_loss, acceleration_accuracy, balanced_accuracy,
@@ -169,7 +173,7 @@ def _check(result: CellResult) -> None:
     if not np.isfinite(result.curves["value"].to_numpy(np.float64)).all():
         raise ValueError("its curves hold values that are not finite")
     for stage, wanted, epochs in (
-        ("encoder", [NO_SEED], settings.encoder.epochs),
+        ("encoder", [NO_SEED] * (result.cell.heads != CEILING), settings.encoder.epochs),
         ("policy", list(range(seeds)), settings.policy.epochs),
     ):
         rows = result.curves[result.curves["stage"] == stage]
@@ -205,14 +209,23 @@ class SweepRecord:
         """Whether every planned cell is finished."""
         return set(self.planned) <= set(self.results)
 
-    def table(self) -> pd.DataFrame:
-        """The tidy table: one row per measured point, columns TABLE_COLUMNS, in the order of the plan."""
+    @property
+    def ceiling(self) -> CellResult | None:
+        """What policies reach that are given the true state, where that cell is finished."""
+        key = next((key for key, cell in self.planned.items() if cell.heads == CEILING), "")
+        return self.results.get(key)
+
+    def table(self, *, ceiling: bool = False) -> pd.DataFrame:
+        """The tidy table: one row per measured point, columns TABLE_COLUMNS, in the order of the plan.
+
+        The ceiling is no head set under study: it is in the table only when asked for.
+        """
         parts = [
             self.results[key].curves.assign(
                 sweep=self.grid.name, heads=cell.heads, fraction=cell.fraction, encoder_seed=cell.encoder_seed
             )
             for key, cell in self.planned.items()
-            if key in self.results
+            if key in self.results and (ceiling or cell.heads != CEILING)
         ]
         if not parts:
             return pd.DataFrame(columns=list(TABLE_COLUMNS))

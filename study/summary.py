@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from study import claims, stats
-from study.config import ACCELERATIONS, HEAD_SETS, parameter_counts
+from study.config import ACCELERATIONS, CEILING, HEAD_SETS, parameter_counts
 from study.result import CellResult, SweepRecord
 from study.stats import Estimate, Panel, Point
 
@@ -37,12 +37,13 @@ def numbers(record: SweepRecord) -> Numbers:
         for verdict in claims.judge(record)
         if verdict.claim in grid.claims or (not grid.claims and (verdict.findings or verdict.missing))
     ]
-    floor = _floors(record)
+    floor, ceiling = _floors(record), _ceiling(record)
     made: Numbers = {
         "format_version": FORMAT_VERSION,
         "sweep": _sweep(record, stats.design(accuracy.values())),
         "floor": floor,
-        "scores": [_score(record, point, panels, floor["accuracy"]) for point in points],
+        "ceiling": ceiling,
+        "scores": [_score(record, point, panels, floor["accuracy"], ceiling) for point in points],
         "comparisons": [
             _contrast(record, contrast)
             for metric, curves in ((stats.ACCURACY, accuracy), (stats.STEERING, steering))
@@ -135,12 +136,24 @@ def _floors(record: SweepRecord) -> Numbers:
     return {"accuracy": math.nan, "steering": math.nan}
 
 
-def _score(record: SweepRecord, point: Point, panels: Mapping[str, Panel], floor: float) -> Numbers:
+def _ceiling(record: SweepRecord) -> Numbers | None:
+    """Accuracy of policies that are given the true state, where they were trained."""
+    if record.ceiling is None:
+        return None
+    table = record.table(ceiling=True)
+    (curves,) = stats.panel(table[table["heads"] == CEILING], stats.ACCURACY).values()
+    return _spread(curves)
+
+
+def _score(
+    record: SweepRecord, point: Point, panels: Mapping[str, Panel], floor: float, ceiling: Numbers | None
+) -> Numbers:
     results = claims.results_at(record, point)
     guesses = [(item.predictions["acceleration"], item.predictions["acceleration_label"]) for item in results]
     recall = np.concatenate([stats.confusion(guess, label) for guess, label in guesses]).mean(axis=0)
     accuracy = panels["accuracy"][point]
     scored = {name: _spread(curves[point]) for name, curves in panels.items() if point in curves}
+    gain = scored["accuracy"]["mean"] - floor
     return {
         "cell": claims.label(point, record.grid),
         "heads": point[0],
@@ -148,7 +161,8 @@ def _score(record: SweepRecord, point: Point, panels: Mapping[str, Panel], floor
         "encoders": stats.encoders(accuracy),
         "n": len(accuracy),
         **scored,
-        "gain": scored["accuracy"]["mean"] - floor,
+        "gain": gain,
+        "share": gain / (ceiling["mean"] - floor) if ceiling and ceiling["mean"] > floor else math.nan,
         "macro_f1": float(np.concatenate([stats.macro_f1(guess, label) for guess, label in guesses]).mean()),
         "confusion": recall.tolist(),
         "classes": list(ACCELERATIONS),

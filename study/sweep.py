@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Literal
 from study.command import Parser, run
 from study.config import DEFAULT_TRACKING, HEADS, BadInputError, parameter_counts
 from study.cost import Cost, cell_cost, clock, size, total
-from study.data import DATA, drives_folder, prepare
+from study.data import DATA, prepare
 from study.plan import Plan, add_machine_options, add_plan_options, check_machine, given_plan, look_up, thread_hint
 from study.provenance import cores, provenance
 
@@ -196,16 +196,18 @@ def execute(plan: Plan, options: argparse.Namespace) -> int:
         queue.plan(waiting)
         jobs = {
             key: CellJob(
-                plan.cells[key],
+                cell,
                 key,
                 plan.settings,
                 plan.grid.policy_seeds,
                 frames,
+                plan.drives,
                 DATA,
                 options.device,
                 options.threads,
             )
-            for key in waiting
+            for key, cell in plan.cells.items()
+            if key in waiting
         }
         try:
             if data:
@@ -213,8 +215,7 @@ def execute(plan: Plan, options: argparse.Namespace) -> int:
                 from study.frames import open_frames  # noqa: PLC0415
 
                 store = open_frames(frames)
-                drives = source_drives(store, drives_folder(plan.settings, DATA, plan.imported))
-                tracker.log_files(sweep_run, card_files(store, drives, frames), "data")
+                tracker.log_files(sweep_run, card_files(store, source_drives(store, plan.drives), frames), "data")
             with Workers(jobs, options.workers, tracker, sweep_run, queue, display) as workers:
                 failed = workers.run()
             status = "FAILED" if failed else "FINISHED"

@@ -83,7 +83,7 @@ def train(plan: Plan, out: Path, device: str, threads: int) -> int:
     except OSError as error:
         raise BadInputError(f"cannot write to {out}: {error.strerror}; name another folder with --out") from error
     jobs = {
-        key: CellJob(cell, key, plan.settings, plan.grid.policy_seeds, plan.frames, DATA, device, threads)
+        key: CellJob(cell, key, plan.settings, plan.grid.policy_seeds, plan.frames, plan.drives, DATA, device, threads)
         for key, cell in plan.cells.items()
         if not (out / key).is_dir()
     }

@@ -154,6 +154,7 @@ def compute_again(plan: Plan, recorded: CellResult, display: Display) -> CellRes
             settings,
             seeds,
             frames,
+            plan.drives,
             Path(scratch),
             device,
             int(recorded.facts["threads"]),

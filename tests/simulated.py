@@ -34,6 +34,7 @@ class World:
     policy_sd: float = 0.002
     epoch_sd: float = 0.0015
     epochs: int = 100
+    ceiling: float = 0.97  # accuracy of policies on the true state
 
 
 NULL = World(
@@ -75,10 +76,15 @@ def _rows(seeds, stage, split, metric, values):
 def policy_curves(cell, world, seeds, rng):
     """Accuracy and steering loss by epoch on both splits, [S, E] each."""
     halvings = -np.log2(cell.fraction) * (1.0 if cell.heads == "rec" else 0.5)
-    final = world.accuracy[cell.heads] - world.by_fraction * halvings + rng.normal(0, world.encoder_sd)
+    final = (
+        world.accuracy.get(cell.heads, world.ceiling) - world.by_fraction * halvings + rng.normal(0, world.encoder_sd)
+    )
     epoch = np.arange(1, world.epochs + 1)
-    shape = np.exp(-epoch / (world.time[cell.heads] * (1 + world.slower * halvings)))
-    own = rng.normal(0, world.policy_sd, (seeds, 1)) + rng.normal(0, world.spread[cell.heads], (seeds, 1)) * shape
+    shape = np.exp(-epoch / (world.time.get(cell.heads, 5.0) * (1 + world.slower * halvings)))
+    own = (
+        rng.normal(0, world.policy_sd, (seeds, 1))
+        + rng.normal(0, world.spread.get(cell.heads, 0.002), (seeds, 1)) * shape
+    )
     test = final - 0.3 * shape + own + rng.normal(0, world.epoch_sd, (seeds, world.epochs))
     loss = world.steering * (1 + 2 * shape) + world.steering_effect * (cell.heads != "rec")
     loss = loss * (1 + rng.normal(0, 0.01, (seeds, 1)) + rng.normal(0, 0.005, (seeds, world.epochs)))
@@ -98,8 +104,8 @@ def simulate_cell(cell, key, settings, world, seeds, rng, labels):
     """A whole result: curves, pictures, predictions whose accuracy is the last epoch's."""
     curves = policy_curves(cell, world, seeds, rng)
     parts = [_rows(np.arange(seeds), "policy", split, metric, values) for (split, metric), values in curves.items()]
-    heads = HEAD_SETS[cell.heads]
-    for split in ("train", "test"):
+    heads = HEAD_SETS.get(cell.heads, ())  # the ceiling has no encoder
+    for split in ("train", "test") if heads else ():
         losses = {head: (0.05 + 0.4 * np.exp(-np.arange(settings.encoder.epochs) / 4))[None] for head in heads}
         parts += [_rows(np.array([NO_SEED]), "encoder", split, f"loss_{head}", loss) for head, loss in losses.items()]
         parts.append(_rows(np.array([NO_SEED]), "encoder", split, "loss", sum(losses.values())))
@@ -108,7 +114,7 @@ def simulate_cell(cell, key, settings, world, seeds, rng, labels):
     wrong = rng.random((seeds, FRAMES)) > accuracy
     guess = (acceleration + wrong * rng.integers(1, 3, (seeds, FRAMES))) % 3
     images = _pictures(rng)
-    samples = {"input": images, "rec_output": (images * 0.9 + 12).astype(np.uint8)}
+    samples = {"input": images, "rec_output": (images * 0.9 + 12).astype(np.uint8)} if heads else {}
     for head in set(heads) - {"rec"}:
         mask = np.where(images.max(axis=3) > 180, 255, 0).astype(np.uint8)
         samples |= {f"{head}_target": mask, f"{head}_output": (mask * 0.7 + 20).astype(np.uint8)}
@@ -117,7 +123,7 @@ def simulate_cell(cell, key, settings, world, seeds, rng, labels):
         key=key,
         settings=settings.model_dump(mode="json") | {"policy_seeds": seeds, "frames_key": "f" * 16},
         curves=pd.concat(parts, ignore_index=True),
-        encoder={"weight": np.zeros(4, np.float32)},
+        encoder={"weight": np.zeros(4, np.float32)} if heads else {},
         policies={"z_mean": np.zeros(64, np.float32)},
         samples=samples,
         predictions={

@@ -53,6 +53,7 @@ def test_dry_run_speaks_json():
     assert [(cell["heads"], cell["encoder_seed"], cell["status"]) for cell in facts["cells"]] == [
         ("full", 0, "waiting"),
         ("full", 1, "waiting"),
+        ("state", 0, "waiting"),
     ]
     assert facts["seconds"] > 0 < facts["bytes"]
 

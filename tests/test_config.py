@@ -43,17 +43,34 @@ def test_heads_sweep_covers_all_head_sets():
     assert load_grid("heads").heads == tuple(HEAD_SETS)
 
 
-def test_datasize_shares_its_full_data_cells_with_heads():
+def test_datasize_shares_its_full_data_cells_and_the_ceiling_with_heads():
     settings = load_profile("laptop")
     keys = [
         {cell_key(settings, cell, grid.policy_seeds, frames_key(settings)) for cell in grid.cells()}
         for grid in (load_grid("heads"), load_grid("datasize"))
     ]
-    assert len(keys[0] & keys[1]) == 2
+    assert len(keys[0] & keys[1]) == 3
 
 
 def test_encoder_seeds_multiply_the_cells():
-    assert len(load_grid("heads", {"encoder_seeds": 3}).cells()) == 3 * len(load_grid("heads").cells())
+    one, three = (load_grid("heads", {"ceiling": False, "encoder_seeds": count}).cells() for count in (1, 3))
+    assert len(three) == 3 * len(one)
+
+
+def test_the_ceiling_is_one_more_cell_and_leaves_the_others_as_they_are():
+    settings = load_profile("laptop")
+    with_, without = (
+        [cell_key(settings, cell, 15, "frames") for cell in load_grid("heads", {"ceiling": there}).cells()]
+        for there in (True, False)
+    )
+    assert with_[:-1] == without
+
+
+def test_the_ceiling_depends_on_frames_and_policies_but_on_no_encoder():
+    cell, one = load_grid("heads").cells()[-1], StudySettings()
+    assert encoder_key(one, cell, "f") == encoder_key(changed(encoder={"epochs": 99}), cell, "f")
+    assert encoder_key(one, cell, "f") != encoder_key(one, cell, "g")
+    assert cell_key(one, cell, 15, "f") != cell_key(changed(policy={"lr": 0.1}), cell, 15, "f")
 
 
 def test_keys_tell_all_cells_of_a_grid_apart():

@@ -11,7 +11,7 @@ LAYERS = [
     {"pool"},
     {"birdview", "sim"},
     {"selection", "adapt"},
-    {"frames", "imported"},
+    {"frames", "imported", "state"},
     {"autoencoder", "policy", "stats"},
     {"cell", "claims", "points", "store"},
     {"tracking", "grid", "figures", "display", "summary", "markdown"},

@@ -83,9 +83,9 @@ def test_where_nothing_was_tracked_all_cells_wait_and_nothing_is_made(tmp_path):
         env=os.environ | {"PYTHONPATH": str(root)},
     )
     title, frames, *lines = done.stdout.splitlines()
-    assert "0 of 4 cells finished, 4 waiting" in title
+    assert "0 of 5 cells finished, 5 waiting" in title
     assert "not made yet" in frames
-    assert [line.split()[-1] for line in lines] == ["waiting"] * 4
+    assert [line.split()[-1] for line in lines] == ["waiting"] * 5
     assert [path.name for path in tmp_path.iterdir()] == ["sweeps"]
 
 

@@ -20,6 +20,7 @@ pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parent.parent
 SMALL = ("--profile", "smoke", "--policy_seeds", "3")
 TWO = ("--heads", "[rec,full]")
+LESS = ("--ceiling", "false")
 
 
 def command(*words):
@@ -64,7 +65,7 @@ def take(folder, to):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A working folder in which `heads` has run with two head sets."""
+    """A working folder in which `heads` has run with two head sets and the ceiling."""
     made = tmp_path_factory.mktemp("sweep")
     shutil.copytree(ROOT / "sweeps", made / "sweeps")
     done = sweep(made, "heads", *SMALL, *TWO)
@@ -86,17 +87,17 @@ def test_the_same_command_again_trains_nothing(folder):
     before = runs(folder)
     done = sweep(folder, "heads", *SMALL, *TWO)
     assert done.returncode == 0
-    assert "2 of 2 cells finished" in done.stderr
+    assert "3 of 3 cells finished" in done.stderr
     assert runs(folder) == before
 
 
 def test_datasize_reuses_the_cells_of_heads(folder):
-    assert status(folder, "datasize", *SMALL, "--fractions", "[1.0,0.5]") == {"finished": 2, "waiting": 2}
+    assert status(folder, "datasize", *SMALL, "--fractions", "[1.0,0.5]") == {"finished": 3, "waiting": 2}
 
 
 def test_a_failed_cell_leaves_the_others_and_is_told(folder, tmp_path):
     take(folder, tmp_path)
-    done = sweep(tmp_path, "heads", *SMALL, "--heads", "[rec,rec+pred]", "--encoder.lr", "1e30", "--no-report")
+    done = sweep(tmp_path, "heads", *SMALL, "--heads", "[rec,rec+pred]", "--encoder.lr", "1e30", *LESS, "--no-report")
     assert done.returncode == 1
     assert "failed: rec 100% e0" in done.stderr
     assert "failed: rec+pred 100% e0" in done.stderr
@@ -130,7 +131,7 @@ def test_a_result_tells_what_made_it(folder):
 def test_a_stopped_sweep_goes_on_and_ends_like_one_that_was_not(folder, tmp_path, how):
     take(folder, tmp_path)
     process = subprocess.Popen(
-        command("heads", *SMALL, *TWO), cwd=tmp_path, stderr=subprocess.PIPE, text=True, env=environment()
+        command("heads", *SMALL, *TWO, *LESS), cwd=tmp_path, stderr=subprocess.PIPE, text=True, env=environment()
     )
     for line in process.stderr:
         if "encoder, epoch" in line or "starting" in line:
@@ -140,7 +141,7 @@ def test_a_stopped_sweep_goes_on_and_ends_like_one_that_was_not(folder, tmp_path
     process.stderr.read()
     assert process.wait(10) != 0
 
-    done = sweep(tmp_path, "heads", *SMALL, *TWO)
+    done = sweep(tmp_path, "heads", *SMALL, *TWO, *LESS)
     assert done.returncode == 0, done.stderr
     assert runs(tmp_path)["FINISHED"] == 2
     assert runs(tmp_path)["RUNNING"] == 0

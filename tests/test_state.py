@@ -1,0 +1,84 @@
+"""The true state: what the expert decides by, read from the frames' labels and the drives they came from."""
+
+import hashlib
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from drives import write_drives
+from study.config import FORMAT_VERSIONS, BadInputError, BirdviewSettings, FramesSettings
+from study.episode import episode_digest, read_episode
+from study.selection import candidates
+from study.state import true_state
+
+COUNT = 3
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    made = tmp_path_factory.mktemp("drives")
+    write_drives(made, COUNT)
+    return made
+
+
+@pytest.fixture(scope="module")
+def labels(folder):
+    """Candidate moments of all drives; the last drive is for testing."""
+    settings = FramesSettings(spacing=0.3), BirdviewSettings()
+    parts = [candidates(path, number, "policy", *settings) for number, path in enumerate(sorted(folder.iterdir()))]
+    made = pd.concat([pd.DataFrame(part) for part in parts], ignore_index=True)
+    return made.assign(train=made["episode"] < COUNT - 1)
+
+
+@pytest.fixture(scope="module")
+def sources(folder):
+    return [{"name": path.name, "digest": episode_digest(path)} for path in sorted(folder.iterdir())]
+
+
+@pytest.fixture(scope="module")
+def state(labels, sources, folder):
+    return true_state(labels, sources, folder)
+
+
+def linear(state, target):
+    """R2 of the best linear model of all frames."""
+    inside = np.column_stack([state, np.ones(len(state))]).astype(np.float64)
+    error = target - inside @ np.linalg.lstsq(inside, target, rcond=None)[0]
+    return 1 - (error**2).sum() / ((target - target.mean()) ** 2).sum()
+
+
+def test_what_the_expert_decides_by_can_be_read_off(state, labels, sources, folder):
+    episodes = [read_episode(folder / source["name"]) for source in sources]
+    targets = {
+        "speed": labels["speed"],
+        "speed a second ago": [
+            episodes[row.episode].speed[row.step - 10, row.agent - 100] for row in labels.itertuples()
+        ],
+        "red": labels["light"] == 2,
+        "gap": labels["lead_gap"].fillna(40.0).clip(upper=40.0),
+        "line": labels["light_distance"].fillna(40.0).clip(upper=40.0),
+    }
+    assert (state.shape, state.dtype) == ((len(labels), 64), np.float32)
+    for name, target in targets.items():
+        assert linear(state, np.asarray(target, np.float64)) > 0.99, name
+
+
+def test_no_number_of_a_test_frame_is_used_for_scaling(state, labels, sources, folder):
+    other = labels.assign(speed=labels["speed"].where(labels["train"], 3.0))
+    train = labels["train"].to_numpy()
+    assert np.array_equal(true_state(other, sources, folder)[train], state[train])
+
+
+def test_other_drives_than_the_frames_were_made_from_are_refused(labels, sources, folder, tmp_path):
+    for wrong in ([source | {"digest": "0"} for source in sources], [source | {"name": "gone"} for source in sources]):
+        with pytest.raises(BadInputError, match="--ceiling false"):
+            true_state(labels, wrong, folder)
+    with pytest.raises(BadInputError, match="--ceiling false"):
+        true_state(labels, sources, tmp_path)
+
+
+def test_the_same_labels_and_drives_give_the_known_state(state):
+    """Code that changes the state must raise FORMAT_VERSIONS["state"], and then this digest."""
+    digest = hashlib.sha256(state.round(3).tobytes()).hexdigest()[:16]
+    assert (FORMAT_VERSIONS["state"], digest) == (1, "8b8a2d392b0e5364")
