@@ -78,12 +78,13 @@ def _cell_status(plan: Plan, key: str, attempts: Sequence[Attempt], now: float, 
         return found
     last = attempts[-1]
     if last.status == "FAILED":
-        return dataclasses.replace(found, state="failed", reason=_first(last.tags.get("reason", "unknown")))
+        state: State = "waiting" if "again" in last.tags else "failed"
+        return dataclasses.replace(found, state=state, reason=_first(last.tags.get("reason", "unknown")))
     if last.status != "RUNNING":
         return found
     tags = last.tags
     quiet = max(0.0, now - float(tags.get("alive", last.started)) / 1000)
-    state: State = "silent" if quiet > SILENT else "running"
+    state = "silent" if quiet > SILENT else "running"
     if tags.get("host") == host and not _runs(tags.get("process", "")):
         state = "dead"
     stage, _, steps = tags.get("progress", "").partition(" ")
@@ -202,5 +203,5 @@ def _row(cell: CellStatus, now: float) -> tuple[str, str, str, str, str]:
         where = f"{cell.host}, process {cell.process}" if cell.host else ""
         where += f", {cell.device}" if cell.device else ""
     elif cell.attempt:
-        how = f"stopped, tried {cell.attempt} time{'s' if cell.attempt > 1 else ''}"
+        how = f"{cell.reason or 'stopped'}; tried {cell.attempt} time{'s' if cell.attempt > 1 else ''}"
     return cell.label, cell.state, how, since, where

@@ -42,6 +42,7 @@ RESULT_FILES = (*(f"{part}.safetensors" for part in ARRAYS), "curves.parquet", "
 PLAN_VERSION = 1
 VALUE_LIMIT = 4000  # characters of a parameter or tag; MLflow takes 6000 and 8000, its databases 8000
 HOST, PROCESS, ALIVE = "host", "process", "alive"  # tags of an attempt: who writes it, and when last [ms since 1970]
+AGAIN = "again"  # tag of a failed attempt that is not the last
 SIGN = 5.0  # [s] between two signs of life
 PARENT, NOTE = "mlflow.parentRunId", "mlflow.note.content"
 FLUSH = 2.0  # [s] between two writes of live curves
@@ -412,12 +413,16 @@ class Tracker:
             self.client.log_batch(cell_run.seeds[seed], metrics=metrics)
             self.client.set_terminated(cell_run.seeds[seed], "FINISHED")
 
-    def fail(self, cell_run: CellRun, reason: str) -> None:
-        """End an attempt that cannot be finished; the reason becomes a tag and, in full, an artifact."""
+    def fail(self, cell_run: CellRun, reason: str, *, again: bool = False) -> None:
+        """End an attempt that cannot be finished; the reason becomes a tag and, in full, an artifact.
+
+        `again`: the cell waits for another attempt.
+        """
         cell_run.stop()
         with self._guard():
             self.client.log_text(cell_run.run_id, masked(reason), "failure.txt")
-            self._close(cell_run.run_id, "FAILED", {"reason": masked(reason)})
+            tags = {"reason": masked(reason)} | ({AGAIN: "true"} if again else {})
+            self._close(cell_run.run_id, "FAILED", tags)
 
     def interrupt(self, cell_run: CellRun) -> None:
         """End an attempt that was stopped, quickly; when the store does not answer, the next attempt closes it."""
