@@ -8,6 +8,7 @@ import errno
 import fcntl
 import multiprocessing
 import os
+import shlex
 import signal
 import sys
 import threading
@@ -20,9 +21,9 @@ import yaml
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from study.config import BadInputError, Grid, StudySettings
+from study.config import BadInputError, Grid, StudySettings, masked
 
-EXIT_BAD_INPUT = 2
+EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
 # A disk that is full, a folder that cannot be: the user can change that, anything else is a fault.
 WRITE_ERRORS = (
     *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG),
@@ -121,6 +122,21 @@ def cannot_write(path: Path, error: OSError) -> str:
         f"cannot write {path}: {error.strerror}; make room or name another folder, then give the same command again: "
         "it goes on where it was"
     )
+
+
+def stoppable(work: Callable[[], int], command: str) -> int:
+    """Do the work and return its exit code; Ctrl-C, or a batch system's SIGTERM, ends it with how to go on."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        return work()
+    except KeyboardInterrupt:
+        print(f"\nStopped. Nothing that was finished is lost. To go on: {command}", file=sys.stderr)
+        return EXIT_INTERRUPTED
+
+
+def typed(module: str, args: Sequence[str]) -> str:
+    """The command line again, for people, without credentials."""
+    return masked(shlex.join(["python", "-m", module, *args]))
 
 
 def obey_parent() -> None:

@@ -54,7 +54,8 @@ def one_of(what: str, got: object, allowed: object) -> BadInputError:
 
 def masked(text: str) -> str:
     """The text with the credentials of any URI in it hidden."""
-    return re.sub(r"(\w://)[^/@\s]*@", r"\1***@", text)
+    text = re.sub(r"(\w://)[^/@\s]*@", r"\1***@", text)
+    return re.sub(r"(?i)\b(password=)[^&\s]+", r"\1***", text)
 
 
 class Settings(BaseModel):
@@ -351,6 +352,9 @@ def parameter_counts() -> dict[str, int]:
 
 SWEEPS = Path("sweeps")
 DEFAULT_TRACKING = "sqlite:///mlruns/mlflow.db"
+DEFAULT_QUEUE = "sqlite:///mlruns/queue.db"
+SHARED_QUEUES = ("postgresql://", "postgresql+psycopg://", "postgresql+psycopg2://")  # else SQLite, on one machine
+DEFAULT_GRACE = 90.0  # [s] without a sign of life after which a worker of a shared queue counts as dead
 
 
 def read_yaml(path: Path) -> dict[str, Any]:

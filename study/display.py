@@ -99,6 +99,12 @@ class Display:
         self._state[key] = f"{STAGES[stage]}, {UNITS[stage]} {done:,}/{whole:,}"
         self.tick()
 
+    def wait(self, key: str, why: str) -> None:
+        """A cell that ran does so no more, and waits again."""
+        self._shares[key] = 0.0
+        self._state.pop(key, None)
+        self.say(f"{self._labels[key]}: {why}")
+
     def finish(self, key: str) -> None:
         """A cell is committed."""
         self._finished += 1

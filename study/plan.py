@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from study.command import GRID_OPTIONS, Parser, add_options, grid_overrides, study_overrides
 from study.config import (
+    DEFAULT_GRACE,
+    DEFAULT_QUEUE,
+    DEFAULT_TRACKING,
+    SHARED_QUEUES,
     SWEEPS,
     BadInputError,
     Cell,
@@ -59,6 +64,11 @@ class Plan:
     def key(self) -> str:
         """Key of the plan: the same cells under the same name."""
         return content_key("plan", {"sweep": self.grid.name, "profile": self.profile}, tuple(self.cells), 1)
+
+    @property
+    def queue_name(self) -> str:
+        """Under which the plan's cells wait in a queue."""
+        return f"{self.grid.name} {self.profile} {self.key}"
 
 
 def make_plan(name: str, profile: str, study: dict[str, Any], grid: dict[str, Any], data: Path | None = None) -> Plan:
@@ -139,3 +149,41 @@ def look_up(tracking: str) -> Tracker | None:
     from study.tracking import Tracker  # noqa: PLC0415
 
     return Tracker.look(tracking)
+
+
+def add_run_options(parser: Parser, workers: str) -> None:
+    """What every command takes that trains the cells of a plan; `workers` says what --workers counts."""
+    parser.add_argument("--workers", type=int, default=1, metavar="N", help=f"{workers} (default: 1)")
+    add_machine_options(parser)
+    parser.add_argument(
+        "--tracking", default=DEFAULT_TRACKING, metavar="URI", help="MLflow store (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--queue",
+        default=os.environ.get("STUDY_QUEUE", DEFAULT_QUEUE),  # not in the help: it may hold a password
+        metavar="URI",
+        help=f"{SHARED_QUEUES[0]}user@host/database for many machines (default: STUDY_QUEUE, else {DEFAULT_QUEUE})",
+    )
+    parser.add_argument(
+        "--grace",
+        type=float,
+        default=DEFAULT_GRACE,
+        metavar="S",
+        help="shared queue: seconds without a sign of life until a worker's cell waits again (default: %(default)g)",
+    )
+    parser.add_argument("--retry-failed", action="store_true", help="try cells again that are listed as failed")
+
+
+def check_run_options(options: argparse.Namespace, fewest_workers: int = 1) -> None:
+    """Raise BadInputError for options of `add_run_options` that cannot be used."""
+    shared = options.queue.startswith(SHARED_QUEUES)
+    if options.workers < fewest_workers:
+        raise BadInputError(f"--workers is {options.workers}; it must be {fewest_workers} or more")
+    if options.grace < 2:
+        raise BadInputError(f"--grace is {options.grace:g}; it must be 2 s or more")
+    if shared and options.tracking.startswith("sqlite"):
+        raise BadInputError(
+            "a shared queue needs a store that all its workers reach: --tracking http://host:port "
+            f"(got {options.tracking}; start one with: mlflow server)"
+        )
+    check_machine(options)

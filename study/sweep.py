@@ -11,24 +11,19 @@ import argparse
 import fcntl
 import json
 import os
-import signal
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
-from study.command import Parser, run
-from study.config import DEFAULT_TRACKING, HEADS, BadInputError, parameter_counts
+from study.command import Parser, run, stoppable, typed
+from study.config import HEADS, SHARED_QUEUES, BadInputError, parameter_counts
 from study.cost import Cost, cell_cost, clock, size, total
-from study.data import DATA, prepare
-from study.plan import Plan, add_machine_options, add_plan_options, check_machine, given_plan, look_up, thread_hint
-from study.provenance import cores, provenance
+from study.plan import Plan, add_plan_options, add_run_options, check_run_options, given_plan, look_up
 
 if TYPE_CHECKING:
     from study.tracking import Tracker
-
-EXIT_FAILED, EXIT_INTERRUPTED = 1, 130
 
 
 # --- the command ----------------------------------------------------------------------------------------------------
@@ -49,9 +44,7 @@ def parser() -> Parser:
     add_plan_options(made)
     made.add_argument("--dry-run", action="store_true", help="show what would run, what is done, and what it costs")
     made.add_argument("--json", action="store_true", help="with --dry-run: one JSON object on stdout")
-    made.add_argument("--workers", type=int, default=1, metavar="N", help="cells trained at a time (default: 1)")
-    add_machine_options(made)
-    made.add_argument("--tracking", default=DEFAULT_TRACKING, metavar="URI", help="MLflow store (default: %(default)s)")
+    add_run_options(made, "cells trained at a time; 0 with a shared queue: watch others")
     made.add_argument(
         "--import-results", type=Path, metavar="DIR", help="train nothing: commit what study.train has left in DIR"
     )
@@ -73,18 +66,15 @@ def main(args: Sequence[str]) -> int:
     plan = given_plan(options)
     if options.json and not options.dry_run:
         raise BadInputError("--json goes with --dry-run; add --dry-run")
-    if options.workers < 1:
-        raise BadInputError(f"--workers is {options.workers}; it must be 1 or more")
-    check_machine(options)
+    shared = options.queue.startswith(SHARED_QUEUES)
+    check_run_options(options, fewest_workers=0 if shared else 1)
     if options.dry_run:
         return dry_run(plan, options.tracking, as_json=options.json)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # a batch system's stop ends as cleanly as Ctrl-C
-    with only_sweep(Path("mlruns") / "sweep.lock"):
-        try:
-            return import_results(plan, options) if options.import_results else execute(plan, options)
-        except KeyboardInterrupt:
-            print("\nStopped. Nothing that was finished is lost; the same command goes on.", file=sys.stderr)
-            return EXIT_INTERRUPTED
+    command = typed("study.sweep", args)
+    with nullcontext() if shared else only_sweep(Path("mlruns") / "sweep.lock"):
+        if options.import_results:
+            return stoppable(lambda: import_results(plan, options), command)
+        return stoppable(lambda: execute(plan, options, command), command)
 
 
 # --- dry run --------------------------------------------------------------------------------------------------------
@@ -161,72 +151,18 @@ def only_sweep(path: Path) -> Iterator[None]:
         yield
 
 
-def execute(plan: Plan, options: argparse.Namespace) -> int:
+def execute(plan: Plan, options: argparse.Namespace, command: str) -> int:
     """Run what is not finished, then write the report."""
     # Imported here, so that --help and --dry-run need none of it.
-    from study.display import Display  # noqa: PLC0415
-    from study.grid import Queue  # noqa: PLC0415
-    from study.result import CellJob  # noqa: PLC0415
+    from study.crew import tell_failed, work  # noqa: PLC0415
     from study.tracking import Tracker  # noqa: PLC0415
-    from study.worker import Workers  # noqa: PLC0415
 
     tracker = Tracker(options.tracking)
-    done = tracker.finished(list(plan.cells))
-    waiting = [key for key in plan.cells if key not in done]
-    costs = {key: cell_cost(plan.settings, plan.cells[key], plan.grid.policy_seeds).seconds for key in waiting}
-    ready = (plan.frames / "manifest.json").is_file()
-    with Display(
-        f"{plan.grid.name} ({plan.profile})",
-        costs,
-        {key: cell.label for key, cell in plan.cells.items()},
-        0.0 if ready else plan.data_cost.seconds,
-    ) as display:
-        frames = plan.frames
-        if waiting:
-            if hint := thread_hint(options.workers, options.threads, cores()):
-                display.say(hint)
-            frames = prepare(plan.settings, DATA, cores(), display.data, plan.imported)
-        manifest = frames / "manifest.json"
-        data = json.loads(manifest.read_text(encoding="utf-8")) if manifest.is_file() else {}
-        if plan.imported:
-            data["writers"] = plan.imported.writers  # a report must not call these drives our town's
-        sweep_run = tracker.open_sweep(plan.grid, plan.profile, plan.settings, plan.cells, data, provenance())
-        status: Literal["FINISHED", "FAILED", "KILLED"] = "KILLED"
-        queue = Queue(f"{plan.grid.name} {plan.profile} {plan.key}", plan.cells)
-        queue.plan(waiting)
-        jobs = {
-            key: CellJob(
-                cell,
-                key,
-                plan.settings,
-                plan.grid.policy_seeds,
-                frames,
-                plan.drives,
-                DATA,
-                options.device,
-                options.threads,
-            )
-            for key, cell in plan.cells.items()
-            if key in waiting
-        }
-        try:
-            if data:
-                from study.card import card_files, source_drives  # noqa: PLC0415
-                from study.frames import open_frames  # noqa: PLC0415
-
-                store = open_frames(frames)
-                tracker.log_files(sweep_run, card_files(store, source_drives(store, plan.drives), frames), "data")
-            with Workers(jobs, options.workers, tracker, sweep_run, queue, display) as workers:
-                failed = workers.run()
-            status = "FAILED" if failed else "FINISHED"
-        finally:
-            tracker.close_sweep(sweep_run, status)
-        if not options.no_report:
-            display.say("writing the report")
-            display.say(f"report: {_publish(plan, tracker)}")
-    for key, reason in failed.items():
-        print(f"failed: {plan.cells[key].label} ({key}): {reason.strip()}", file=sys.stderr)
-    return EXIT_FAILED if failed else 0
+    failed = work(plan, options, tracker, lead=True)
+    if not options.no_report:
+        print("writing the report", file=sys.stderr)
+        print(f"report: {_publish(plan, tracker)}", file=sys.stderr)
+    return tell_failed(plan, failed, command)
 
 
 def import_results(plan: Plan, options: argparse.Namespace) -> int:

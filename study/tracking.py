@@ -192,10 +192,13 @@ class Tracker:
         planned: Mapping[str, Cell],
         data: Mapping[str, Any],
         provenance: Mapping[str, Any],
+        *,
+        join: bool = False,
     ) -> str:
         """The run id of this plan's sweep run: the one there is, taken up again, or a new one.
 
-        `data` is the frame store's manifest; it becomes an MLflow dataset whose digest is its `key`.
+        `data` is the frame store's manifest; it becomes an MLflow dataset whose digest is its `key`. Who only wants to
+        `join` what another machine has opened leaves what is written there as it is.
         """
         plan: dict[str, Any] = {
             "format_version": PLAN_VERSION,
@@ -221,6 +224,8 @@ class Tracker:
             if mine:
                 run_id = str(mine[0].info.run_id)
                 self.client.update_run(run_id, status="RUNNING")
+                if join:
+                    return run_id
             else:
                 identity = {"kind": "sweep", "sweep": grid.name, "profile": profile, "plan_key": key, NOTE: grid.title}
                 identity["mlflow.source.name"] = f"python -m study.sweep {grid.name} --profile {profile}"
@@ -315,7 +320,7 @@ class Tracker:
         wanted = set(keys)
         runs = self._search("tags.kind = 'cell' and attributes.status = 'FINISHED'")
         found: dict[str, Run] = {}
-        for run in sorted(runs, key=lambda run: (run.info.end_time, run.info.run_id)):
+        for run in sorted(runs, key=_finished_order):
             key = run.data.tags.get("cell_key")
             if key in wanted:
                 found.setdefault(key, run)
@@ -399,7 +404,21 @@ class Tracker:
                 tags=[RunTag(name, _short(value)) for name, value in words.items()],
             )
             self.client.set_terminated(cell_run.run_id, "FINISHED")
-        return cell_run.run_id
+            return self._settle(cell_run)
+
+    def _settle(self, cell_run: CellRun) -> str:
+        """Leave one finished run of a key: a process may have been stopped between its last look and its last word."""
+        first, *others = sorted(
+            (
+                run
+                for run in self._search(f"tags.cell_key = '{cell_run.key}' and attributes.status = 'FINISHED'")
+                if run.data.tags.get("kind") == "cell"
+            ),
+            key=_finished_order,
+        )
+        for other in others:
+            self._close(other.info.run_id, "KILLED", {"superseded_by": first.info.run_id})
+        return str(first.info.run_id)
 
     def _log_seeds(self, cell_run: CellRun, curves: pd.DataFrame, scores: pd.DataFrame) -> None:
         start = cell_run.started
@@ -424,11 +443,11 @@ class Tracker:
             tags = {"reason": masked(reason)} | ({AGAIN: "true"} if again else {})
             self._close(cell_run.run_id, "FAILED", tags)
 
-    def interrupt(self, cell_run: CellRun) -> None:
+    def interrupt(self, cell_run: CellRun, reason: str = "stopped") -> None:
         """End an attempt that was stopped, quickly; when the store does not answer, the next attempt closes it."""
         cell_run.stop(wait=False)
         with suppress(TrackerLostError), self._guard(), few_tries():
-            self._close(cell_run.run_id, "KILLED", {"reason": "stopped"})
+            self._close(cell_run.run_id, "KILLED", {"reason": reason})
 
     def load_result(self, run_id: str) -> CellResult:
         """The result that a finished cell run holds. Raises BadInputError when it is not whole."""
@@ -532,6 +551,10 @@ def _welcome(experiment: str) -> dict[str, str]:
         NOTE: f"Each sweep unfolds to its cells, each cell to its policy seeds. [All cells with their scores]({link})",
         "mlflow.sharedViewState.cells": json.dumps(view),
     }
+
+
+def _finished_order(run: Run) -> tuple[int, str]:
+    return int(run.info.end_time), str(run.info.run_id)
 
 
 def _opened(run: Run) -> int:

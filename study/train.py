@@ -26,6 +26,7 @@ from study.config import BadInputError
 from study.cost import cell_cost
 from study.data import DATA, prepare
 from study.plan import Plan, add_machine_options, add_plan_options, check_machine, given_plan
+from study.scratch import using
 
 if TYPE_CHECKING:  # --help and errors in the settings come without these
     from study.display import Display
@@ -91,9 +92,12 @@ def train(plan: Plan, out: Path, device: str, threads: int) -> int:
     labels = {key: cell.label for key, cell in plan.cells.items()}
     ready = (plan.frames / "manifest.json").is_file()
     failed = {}
-    with Display(
-        f"{plan.grid.name} ({plan.profile})", costs, labels, 0.0 if ready else plan.data_cost.seconds
-    ) as display:
+    with (
+        Display(
+            f"{plan.grid.name} ({plan.profile})", costs, labels, 0.0 if ready else plan.data_cost.seconds
+        ) as display,
+        using(DATA, lambda _: ()),
+    ):
         if jobs:
             prepare(plan.settings, DATA, cores(), display.data, plan.imported)
             shutil.copyfile(plan.frames / "manifest.json", out / f"frames-{plan.frames.name}.json")

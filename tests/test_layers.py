@@ -7,19 +7,20 @@ from pathlib import Path
 ROOT = Path(__file__).parent.parent
 LAYERS = [
     {"config"},
-    {"episode", "result", "cost", "command", "provenance"},
+    {"episode", "result", "cost", "command", "provenance", "scratch"},
     {"pool"},
     {"birdview", "sim"},
     {"selection", "adapt"},
     {"frames", "imported", "state"},
     {"autoencoder", "policy", "stats"},
     {"cell", "claims", "points", "store"},
+    {"child"},
     {"tracking", "grid", "figures", "display", "summary", "markdown"},
     {"drawings", "card", "preview", "comparison"},
     {"data"},
     {"plan"},
-    {"report", "worker", "intake", "status", "verify"},
-    {"sweep", "train"},
+    {"report", "crew", "intake", "status", "verify"},
+    {"sweep", "train", "worker"},
 ]
 OWNERS = {
     "pydantic": {"config", "command"},
@@ -35,7 +36,7 @@ OWNERS = {
     "PIL": {"preview"},
     "typst": {"report"},
     "rich": {"display"},
-    "argparse": {"command", "plan", "sweep", "report", "data"},
+    "argparse": {"command", "plan", "crew", "sweep", "worker", "report", "data"},
 }
 
 
