@@ -278,7 +278,7 @@ def encoder(heads: str, size: str, limits: Numbers) -> Numbers:
 
 def memory(precision: str) -> int:
     """Highest memory of a process of its own that trains `full` at the paper's batch, beside mapped files [bytes]."""
-    program = [sys.executable, __file__, "--memory", precision]
+    program = [sys.executable, *sys.argv, "--memory", precision]
     return int(subprocess.run(program, check=True, capture_output=True, text=True).stdout)
 
 
@@ -431,15 +431,18 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="try everything on almost no data; keep nothing")
     parser.add_argument("--memory", metavar="PRECISION", help="measure the memory of training, as the others do")
     options = parser.parse_args()
-    if options.memory:
-        train_for_memory(options.memory)
-        return
     if options.quick:
         BATCHES.update(laptop=16, paper=64)
         FRAMES.update(laptop=(64, 16), paper=(128, 32))
         POLICY_FRAMES.update(laptop=(1000, 250), paper=(2048, 500))
+    if options.memory:
+        train_for_memory(options.memory)
+        return
     result: Numbers = {"machine": machine(), "limits": peaks(256 if options.quick else 2048)}
-    encoders = [encoder(heads, size, result["limits"]) for size in BATCHES for heads in ("rec", "full")]
+    encoders = []
+    for size, heads in itertools.product(BATCHES, ("rec", "full")):
+        encoders.append(encoder(heads, size, result["limits"]))
+        print(json.dumps(encoders[-1]), file=sys.stderr)  # it takes minutes: what is measured should not be lost
     result["encoder"] = {
         "images_per_s": encoders[-1]["images_per_s"]["ours"]["median"],  # `full` at the paper's batch
         "ratio_to_bare": min(each["ratio_to_bare"]["median"] for each in encoders),
