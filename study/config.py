@@ -223,6 +223,7 @@ class Grid(Settings):
     ceiling: bool = Field(default=True, description="one more cell: policies on the true state, as a ceiling")
     claims: tuple[str, ...] = Field((), description="claims of the paper that this sweep tests")
     rules: Rules = Field(Rules(), description="when a claim counts as reproduced")
+    settings: dict[str, Any] = Field(default_factory=dict, description="settings that differ from every profile's")
 
     @model_validator(mode="after")
     def _known(self) -> Self:

@@ -23,7 +23,7 @@ def draw(record: SweepRecord, made: Numbers) -> list[Drawing]:
         own = [*_speed(record, made), *_fractions(made)]
     else:
         own = [_heads(record, made, "test", "main"), _heads(record, made, "train", "train")]
-    return [*own, *_differences(made), *_latents(record, made), *_pictures(record, made)]
+    return [*own, *_differences(made), *_confounds(made), *_latents(record, made), *_pictures(record, made)]
 
 
 def _bands(made: Numbers) -> str:
@@ -160,6 +160,31 @@ def _differences(made: Numbers) -> list[Drawing]:
             ),
         )
     ]
+
+
+def _confounds(made: Numbers) -> list[Drawing]:
+    """Each confound's contrasts under both of its values."""
+    drawings = []
+    for row in made["confounds"]:
+        pairs = row["contrasts"]
+        if not pairs or pairs[0]["here"]["low"] is None or pairs[0]["there"]["low"] is None:
+            continue
+        told = "; ".join(
+            f"{pair['name']}: {100 * pair['here']['value']:+.2f} and {100 * pair['there']['value']:+.2f} points"
+            for pair in pairs
+        )
+        counts = sorted({pair[side]["n"] for pair in pairs for side in ("here", "there")})
+        drawings.append(
+            Drawing(
+                f"confound_{row['setting'].replace('.', '_')}",
+                f"confound {row['setting']}",
+                f"Differences in final test acceleration accuracy under both values of {row['setting']}, paired by "
+                f"seed, n = {' or '.join(map(str, counts))} pairs. Bar: 95 % interval ({pairs[0]['here']['kind']}).",
+                f"Dot plot of differences with {row['setting']} {row['here']} and {row['there']}. {told}.",
+                figures.both_values(pairs, row["setting"], (row["here"], row["there"])),
+            )
+        )
+    return drawings
 
 
 def _latents(record: SweepRecord, made: Numbers) -> list[Drawing]:

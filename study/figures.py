@@ -342,6 +342,33 @@ def differences(rows: Sequence[Mapping[str, float | str]], allowance: float) -> 
     return figure
 
 
+def both_values(rows: Sequence[Mapping[str, Any]], setting: str, values: tuple[str, str]) -> Figure:
+    """Differences in accuracy [points] under two values of a setting, with their intervals.
+
+    Each row has name, and here and there with value, low, high (shares, not points).
+    """
+    with mpl.rc_context(STYLE):
+        figure, (axes,) = _figure(0.75 + 0.34 * len(rows))
+        axes.axvline(0, color=GREY, linewidth=0.6)
+        for side, value, shift, colour, marker in (
+            ("here", values[0], -0.14, COLOUR["rec"], "o"),
+            ("there", values[1], 0.14, COLOUR["full"], "D"),
+        ):
+            for index, row in enumerate(rows):
+                middle, low, high = (100 * float(row[side][name]) for name in ("value", "low", "high"))
+                label = f"{setting} {value}" if index == 0 else None
+                axes.hlines(index + shift, low, high, color=colour, linewidth=1.4)
+                fill = colour if side == "here" else "white"
+                axes.plot(middle, index + shift, marker, color=colour, markerfacecolor=fill, markersize=4, label=label)
+        axes.set_yticks(range(len(rows)), [str(row["name"]) for row in rows])
+        axes.set_ylim(len(rows) - 0.5, -0.5)
+        axes.spines["left"].set_visible(False)
+        axes.tick_params(axis="y", length=0)
+        axes.set_xlabel("difference in acceleration accuracy, test [percentage points]")
+        figure.legend(loc="outside upper right", ncols=2, frameon=False)
+    return figure
+
+
 # --- latents --------------------------------------------------------------------------------------------------------
 
 Map = tuple[str, NDArray[np.float64], NDArray[np.float64], NDArray[np.float32], NDArray[np.uint8]]

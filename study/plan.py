@@ -24,6 +24,7 @@ from study.config import (
     frames_key,
     load_grid,
     load_profile,
+    merge,
     named_files,
 )
 from study.cost import Cost, data_cost
@@ -76,7 +77,8 @@ def make_plan(name: str, profile: str, study: dict[str, Any], grid: dict[str, An
 
     Raises BadInputError.
     """
-    settings, loaded = load_profile(profile, study), load_grid(name, grid)
+    loaded = load_grid(name, grid)
+    settings = load_profile(profile, merge(loaded.settings, study))
     imported = open_import(data) if data else None
     if imported:
         imported.assign(settings.frames)  # too few drives are told now

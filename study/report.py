@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -79,6 +80,7 @@ def _write(path: Path, content: bytes) -> None:
 def publish(tracker: Tracker, name: str, profile: str | None, folder: Path) -> Path:
     """Build the report from the tracker alone, and add it to the sweep's run. Returns the PDF's path."""
     record = tracker.read_sweep(name, profile)
+    record = replace(record, variants=tracker.read_variants(record))
     pdf = build_report(record, folder)
     own, sweep_run = folder / name, tracker.sweep_run(name, profile)
     tracker.log_files(sweep_run, [pdf, own / "report.json", own / "curves.parquet"], "report")

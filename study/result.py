@@ -192,7 +192,8 @@ def _check(result: CellResult) -> None:
 class SweepRecord:
     """A sweep as the tracker knows it: what was planned, what is finished, what failed (key -> reason).
 
-    `provenance`: commit, uncommitted diff, versions, machine; `data`: the frame store's manifest.
+    `provenance`: commit, uncommitted diff, versions, machine; `data`: the frame store's manifest; `variants`: sweeps
+    that differ in one setting only, by its name.
     """
 
     grid: Grid
@@ -203,6 +204,7 @@ class SweepRecord:
     failed: dict[str, str] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
     data: dict[str, Any] = field(default_factory=dict)
+    variants: dict[str, SweepRecord] = field(default_factory=dict)
 
     @property
     def complete(self) -> bool:

@@ -241,6 +241,15 @@ def paired(first: pd.Series, second: pd.Series) -> pd.Series:
     return (first - second).dropna()
 
 
+def unpaired(first: Array, second: Array, level: float = LEVEL) -> Estimate:
+    """Difference of two means of independent values, first minus second, with Welch's interval."""
+    value, n = float(first.mean() - second.mean()), min(len(first), len(second))
+    if n < 2:
+        return Estimate(value, math.nan, math.nan, n, "no interval from one value", level)
+    found = scipy_stats.ttest_ind(first, second, equal_var=False).confidence_interval(level)
+    return Estimate(value, float(found.low), float(found.high), n, "Welch's t, over policy or encoder seeds", level)
+
+
 def sign_flip(differences: Array) -> float:
     """Two-sided p of the mean under all flips of signs: exact up to 20 pairs, beyond that from random flips.
 

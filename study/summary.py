@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from study import claims, stats
+from study import claims, confounds, stats
 from study.config import ACCELERATIONS, CEILING, HEAD_SETS, parameter_counts
 from study.result import CellResult, SweepRecord
 from study.stats import Estimate, Panel, Point
@@ -53,6 +53,7 @@ def numbers(record: SweepRecord) -> Numbers:
         "convergence": [
             _convergence(record, point, accuracy[point], accuracy[base]) for point in points if base in accuracy
         ],
+        "confounds": _confounds(record),
         "components": [
             {"cell": claims.label(point, grid), **stats.variance_components(accuracy[point])} for point in points
         ],
@@ -182,8 +183,33 @@ def _interval(found: Estimate) -> Numbers:
 
 
 def _contrast(record: SweepRecord, contrast: claims.Contrast) -> Numbers:
-    names = [claims.label(point, record.grid) for point in (contrast.first, contrast.second)]
-    return {"name": f" {claims.MINUS} ".join(names), **dataclasses.asdict(contrast)}
+    return {"name": _difference(record, contrast.first, contrast.second), **dataclasses.asdict(contrast)}
+
+
+def _confounds(record: SweepRecord) -> list[Numbers]:
+    """Contrasts under both values of each setting that may confound them; without any where no sweep varies it."""
+    rows = []
+    for confound in confounds.concerned(record):
+        other = record.variants.get(confound.setting)
+        found = confounds.contrasts(record, other, confound) if other else []
+        rows.append(
+            {
+                "setting": confound.setting,
+                "about": confound.about,
+                "here": confounds.value(record.settings, confound.setting),
+                "there": confounds.value(other.settings, confound.setting) if other else None,
+                "sweep": other.grid.name if other else confound.sweep,
+                "floor": _floors(other)["accuracy"] if other else None,
+                "contrasts": [
+                    {"name": _difference(record, row.first, row.second), **dataclasses.asdict(row)} for row in found
+                ],
+            }
+        )
+    return rows
+
+
+def _difference(record: SweepRecord, first: Point, second: Point) -> str:
+    return f" {claims.MINUS} ".join(claims.label(point, record.grid) for point in (first, second))
 
 
 def _convergence(record: SweepRecord, point: Point, curves: pd.DataFrame, base: pd.DataFrame) -> Numbers:

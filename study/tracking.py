@@ -28,6 +28,7 @@ from typing import Any, Literal, Self
 import pandas as pd
 
 from study.config import DEFAULT_TRACKING, BadInputError, Cell, Grid, StudySettings, content_key, masked
+from study.confounds import contrasts, varied
 from study.points import COMMIT, Point, bands, cell_points, facts_of, flatten, points, scores_of
 from study.result import ARRAYS, CellResult, SweepRecord
 from study.store import TROUBLES, TrackerLostError, alone, few_tries, guard, open_store
@@ -285,7 +286,29 @@ class Tracker:
 
     def read_sweep(self, name: str, profile: str | None = None) -> SweepRecord:
         """The latest sweep of that name with its finished cells, whichever sweep has trained them."""
-        run_id = self.sweep_run(name, profile)
+        return self._read(self.sweep_run(name, profile))
+
+    def read_variants(self, record: SweepRecord) -> dict[str, SweepRecord]:
+        """Sweeps of the same profile that differ from this one in one confound alone; of each the latest."""
+        found: dict[str, SweepRecord] = {}
+        with self._guard():
+            sweeps = sorted(self._search("tags.kind = 'sweep'"), key=_opened, reverse=True)
+        for run in sweeps:
+            if run.data.tags.get("profile") != record.profile:
+                continue
+            try:
+                settings = StudySettings.model_validate(self._json(run.info.run_id, "plan.json")["settings"])
+                confound = varied(record.settings, settings)
+                if confound is None or confound.setting in found:
+                    continue
+                other = self._read(run.info.run_id)
+            except (BadInputError, ValueError):  # planned by another version, or damaged: nothing to compare with
+                continue
+            if contrasts(record, other, confound):
+                found[confound.setting] = other
+        return found
+
+    def _read(self, run_id: str) -> SweepRecord:
         with self._guard():
             plan = self._json(run_id, "plan.json")
             if plan.get("format_version") != PLAN_VERSION:

@@ -18,7 +18,7 @@ def sweep(*words, cwd=None):
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (["heds"], "choose from datasize, heads"),
+        (["heds"], "choose from datasize, datasize-budget-steps"),
         (["heads", "--profile", "desktop"], "choose from laptop, paper, smoke"),
         (["heads", "--encoder.epohcs", "5"], "did you mean --encoder.epochs?"),
         (["heads", "--encoder.epochs", "five"], "encoder.epochs"),

@@ -150,7 +150,7 @@ def test_wrong_settings_are_explained(overrides, words):
 
 
 def test_unknown_names_list_the_known_ones():
-    with pytest.raises(BadInputError, match="choose from datasize, heads"):
+    with pytest.raises(BadInputError, match="choose from datasize, datasize-budget-steps"):
         load_grid("head")
     with pytest.raises(BadInputError, match="choose from laptop, paper, smoke"):
         load_profile("desktop")

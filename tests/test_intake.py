@@ -17,13 +17,24 @@ from study.result import load_results
 from study.sweep import EXIT_INTERRUPTED, main
 from study.tracking import Tracker
 
-PLAN = ("heads", "--profile", "smoke", "--heads", "[rec,full]", "--policy_seeds", "2", "--no-report")
+PLAN = (
+    "heads",
+    "--profile",
+    "smoke",
+    "--heads",
+    "[rec,full]",
+    "--policy_seeds",
+    "2",
+    "--ceiling",
+    "false",
+    "--no-report",
+)
 DEVICE = "a GPU far away"
 
 
 @pytest.fixture(scope="module")
 def plan():
-    return make_plan("heads", "smoke", {}, {"heads": ["rec", "full"], "policy_seeds": 2})
+    return make_plan("heads", "smoke", {}, {"heads": ["rec", "full"], "policy_seeds": 2, "ceiling": False})
 
 
 @pytest.fixture(scope="module")

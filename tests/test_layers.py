@@ -14,7 +14,7 @@ LAYERS = [
     {"frames", "imported", "state"},
     {"autoencoder", "policy", "stats"},
     {"cell", "claims", "points", "store"},
-    {"child"},
+    {"child", "confounds"},
     {"tracking", "grid", "figures", "display", "summary", "markdown"},
     {"drawings", "card", "preview", "comparison"},
     {"data"},

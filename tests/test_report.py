@@ -182,6 +182,26 @@ def test_publish_builds_from_the_tracker_alone_and_logs_what_it_made(tracker, co
     assert {"report/pair.pdf", "report/report.json", "figures/test_compare_heads.svg"} <= logged
 
 
+def test_a_sweep_that_varies_one_setting_is_found_and_takes_nobodys_place(tracker, committed):
+    record = committed[0]
+    settings = record.settings.model_copy(
+        update={"frames": record.settings.frames.model_copy(update={"split": "frame"})}
+    )
+    other = simulate(record.grid.model_copy(update={"name": "pair-split"}), World(epochs=6), settings=settings)
+    planned = {f"v{key[1:]}": cell for key, cell in other.planned.items()}
+    run = tracker.open_sweep(other.grid, other.profile, settings, planned, other.data, other.provenance)
+    for key, result in other.results.items():
+        new = f"v{key[1:]}"
+        tracker.commit(tracker.start_cell(run, planned[new], new, settings, 3), replace(result, key=new))
+    tracker.close_sweep(run, "FINISHED")
+    assert {name: one.grid.name for name, one in tracker.read_variants(record).items()} == {
+        "frames.split": "pair-split"
+    }
+    back = tracker.read_variants(tracker.read_sweep("pair-split"))
+    assert {name: one.grid.name for name, one in back.items()} == {"frames.split": "pair"}
+    assert tracker.read_sweep("pair").settings == record.settings
+
+
 def test_compare_takes_files_folders_and_sweeps_in_mlflow(tracker, committed, tmp_path, capsys):
     (tmp_path / "report.json").write_text(json.dumps(numbers(committed[0])))
     for other in (tmp_path / "report.json", f"pair@{tracker.uri}", f"pair:laptop@{tracker.uri}"):

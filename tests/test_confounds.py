@@ -1,0 +1,96 @@
+"""A confound is a sweep that differs in one setting alone; its differences stand beside those that it may explain."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from simulated import DATASIZE_GRID, HEADS_GRID, World, simulate
+from study import stats
+from study.config import StudySettings, load_grid
+from study.confounds import CONFOUNDS, concerned, contrasts, varied
+from study.plan import make_plan
+from study.report import build_report
+from study.summary import numbers
+
+SPLIT = CONFOUNDS[0]
+FAST = World(epochs=8)
+
+
+def changed(**groups):
+    return StudySettings.model_validate(groups)
+
+
+def with_variant(record, **more):
+    """The record, and one of the same kind whose frames are split differently."""
+    other = simulate(seed=1, settings=changed(frames={"split": "frame"}), **more)
+    grid = other.grid.model_copy(update={"name": "heads-split-frame"})
+    return replace(record, variants={SPLIT.setting: replace(other, grid=grid)})
+
+
+def test_settings_that_differ_in_one_confound_alone_are_told_from_others():
+    plain = StudySettings()
+    assert varied(plain, changed(frames={"split": "frame"})) is SPLIT
+    assert varied(changed(frames={"split": "frame"}), plain) is SPLIT
+    assert varied(plain, plain) is None
+    assert varied(plain, changed(frames={"split": "frame"}, encoder={"epochs": 3})) is None
+    assert varied(plain, changed(encoder={"epochs": 3})) is None
+
+
+@pytest.mark.parametrize("confound", CONFOUNDS, ids=lambda confound: confound.setting)
+@pytest.mark.parametrize("profile", ["smoke", "laptop", "paper"])
+def test_the_file_of_a_confound_varies_it_and_nothing_else(confound, profile):
+    main = "datasize" if confound.fractions else "heads"
+    one, other = (make_plan(name, profile, {}, {}) for name in (main, confound.sweep))
+    assert varied(one.settings, other.settings) is confound
+    assert set(other.grid.fractions) <= set(one.grid.fractions)
+    assert other.grid.policy_seeds == one.grid.policy_seeds
+    shared = set(one.cells) & set(other.cells)
+    assert len(shared) == (2 if confound.fractions else 0)  # at all the data, fractions of what makes no difference
+
+
+def test_the_command_line_goes_before_a_sweeps_own_settings():
+    plan = make_plan("heads-split-frame", "smoke", {"frames": {"split": "episode"}}, {})
+    assert plan.settings.frames.split == "episode"
+
+
+def test_a_difference_that_a_setting_makes_is_seen_and_one_that_it_does_not_is_not():
+    record = simulate(HEADS_GRID, FAST)
+    lifted = replace(FAST, accuracy=FAST.accuracy | {"full": FAST.accuracy["full"] + 0.05})
+    for world, states in ((FAST, {"open"}), (lifted, {"open", "moved"})):
+        other = simulate(HEADS_GRID, world, seed=1)
+        rows = contrasts(record, other, SPLIT)
+        assert [row.first[0] for row in rows] == ["rec+pred", "rec+plan", "full"]
+        assert {row.state for row in rows} == states
+        assert [row.first[0] for row in rows if row.state == "moved"] == ["full"] * (len(states) - 1)
+
+
+def test_what_matters_below_all_the_data_is_shown_there_only():
+    record = simulate(DATASIZE_GRID, FAST)
+    budget = next(confound for confound in CONFOUNDS if confound.setting == "encoder.budget")
+    assert {row.first[1] for row in contrasts(record, record, budget)} == {0.5, 0.25, 0.125, 0.0625}
+
+
+def test_welchs_interval_covers_a_true_difference():
+    rng = np.random.default_rng(0)
+    found = [stats.unpaired(rng.normal(0.3, 1, 15), rng.normal(0, 2, 8)) for _ in range(800)]
+    assert 0.93 < np.mean([each.low < 0.3 < each.high for each in found]) < 0.97
+
+
+def test_a_sweep_without_variants_lists_how_to_run_each(tmp_path):
+    made = numbers(simulate(HEADS_GRID, FAST))
+    assert [row["sweep"] for row in made["confounds"]] == [confound.sweep for confound in concerned(simulate())]
+    assert all(row["contrasts"] == [] for row in made["confounds"])
+    for row in made["confounds"]:
+        load_grid(row["sweep"])
+
+
+def test_a_report_shows_the_differences_under_both_values(tmp_path):
+    pdf = build_report(with_variant(simulate(HEADS_GRID, FAST), world=FAST), tmp_path)
+    from pypdf import PdfReader
+
+    text = " ".join(" ".join(page.extract_text().split()) for page in PdfReader(pdf).pages)
+    assert "frames.split: episode here, frame in heads-split-frame" in text
+    assert "python -m study.sweep heads-brake-hold-0" in text
+    assert "python -m study.sweep heads-split-frame" not in text.split("Provenance")[0]
+    assert (tmp_path / "heads" / "figures" / "confound_frames_split.svg").is_file()
