@@ -32,7 +32,7 @@ from study.cost import cell_cost
 from study.data import DATA, prepare
 from study.display import Display
 from study.frames import open_frames
-from study.grid import Queue, QueueLostError, Ticket
+from study.grid import TRIES, Queue, QueueLostError, Ticket
 from study.plan import Plan, thread_hint
 from study.provenance import cores, provenance
 from study.result import CellJob, CellResult
@@ -229,7 +229,8 @@ class Crew:
                 pass
             case _:
                 passing, reason = True, f"the process ended with code {worker.process.exitcode}"
-        self._patiently(self._tracker.fail, worker.run, reason)
+        again = passing and worker.ticket.attempt < TRIES
+        self._patiently(self._tracker.fail, worker.run, reason, again=again)
         if self._patiently(self._queue.fail, worker.ticket, reason, passing=passing):
             self._display.wait(worker.job.key, f"{reason.strip().splitlines()[-1]}; it will be tried again")
 

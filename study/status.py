@@ -149,7 +149,7 @@ def main(args: Sequence[str]) -> int:
     made = Parser(
         prog="study.sweep status",
         usage="python -m study.sweep status NAME [--profile P] [--tracking URI] [--json] [--group.setting VALUE ...]",
-        description="What of a sweep is finished, what runs where, what is left; with the words that started it.",
+        description="What of a sweep is finished, what runs where, what is left. Settings must be those of the sweep.",
     )
     add_plan_options(made)
     made.add_argument("--tracking", default=DEFAULT_TRACKING, metavar="URI", help="MLflow store (default: %(default)s)")
