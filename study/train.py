@@ -99,6 +99,7 @@ def train(plan: Plan, out: Path, device: str, threads: int) -> int:
         using(DATA, lambda _: ()),
     ):
         if jobs:
+            _check_installed()
             prepare(plan.settings, DATA, cores(), display.data, plan.imported)
             shutil.copyfile(plan.frames / "manifest.json", out / f"frames-{plan.frames.name}.json")
         for key, job in jobs.items():
@@ -112,6 +113,16 @@ def train(plan: Plan, out: Path, device: str, threads: int) -> int:
     if failed:
         return EXIT_FAILED
     return 0 if all((out / key).is_dir() for key in plan.cells) else EXIT_AGAIN
+
+
+def _check_installed() -> None:
+    """Raise BadInputError when the machine lacks what training needs, before hours are spent on the data."""
+    try:
+        import study.cell  # noqa: F401, PLC0415
+    except ModuleNotFoundError as error:
+        raise BadInputError(
+            f"{error.name} is not installed here; bring its wheel along (WHEELS in benchmarks/paper_scale.sh)"
+        ) from error
 
 
 def _train_cell(job: CellJob, folder: Path, display: Display) -> str:

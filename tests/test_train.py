@@ -136,6 +136,13 @@ def test_drives_that_are_missing_without_a_simulator_are_told(home, tmp_path, mo
         main([*PLAN, "--recording.seed", "5", "--out", str(tmp_path)])
 
 
+def test_a_library_that_is_missing_is_told_before_the_data_is_made(home, tmp_path, monkeypatch):
+    monkeypatch.delitem(sys.modules, "study.cell")
+    monkeypatch.setitem(sys.modules, "study.autoencoder", None)
+    with pytest.raises(BadInputError, match="is not installed here; bring its wheel along"):
+        main([*PLAN, "--frames.seed", "5", "--out", str(tmp_path)])
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
