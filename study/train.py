@@ -21,7 +21,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from study.command import Parser, run
+from study.command import EXIT_FAILED, EXIT_INTERRUPTED, Parser, run, stoppable, typed
 from study.config import BadInputError
 from study.cost import cell_cost
 from study.data import DATA, prepare
@@ -32,7 +32,7 @@ if TYPE_CHECKING:  # --help and errors in the settings come without these
     from study.display import Display
     from study.result import CellJob
 
-EXIT_FAILED, EXIT_AGAIN, EXIT_INTERRUPTED = 1, 75, 130
+EXIT_AGAIN = 75  # cells are left: the same command goes on
 
 
 def parser() -> Parser:
@@ -60,17 +60,15 @@ def main(args: Sequence[str]) -> int:
         raise BadInputError(f"--limit-seconds is {limit}; it must be above 0")
     plan = given_plan(options)
     check_machine(options)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # a batch system's stop ends as cleanly as Ctrl-C
+    if limit is not None:
+        signal.signal(signal.SIGALRM, signal.default_int_handler)
+        signal.setitimer(signal.ITIMER_REAL, limit)
     try:
-        if limit is not None:
-            signal.signal(signal.SIGALRM, signal.default_int_handler)
-            signal.setitimer(signal.ITIMER_REAL, limit)
-        return train(plan, options.out, options.device, options.threads)
-    except KeyboardInterrupt:
-        print("\nStopped. Nothing that was finished is lost; the same command goes on.", file=sys.stderr)
-        return EXIT_AGAIN if limit is not None and time.monotonic() - began >= limit else EXIT_INTERRUPTED
+        code = stoppable(lambda: train(plan, options.out, options.device, options.threads), typed("study.train", args))
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
+    up = limit is not None and time.monotonic() - began >= limit
+    return EXIT_AGAIN if up and code == EXIT_INTERRUPTED else code
 
 
 def train(plan: Plan, out: Path, device: str, threads: int) -> int:

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from simulated import EPISODES, FRAMES, World, simulate_cell
+from study.command import EXIT_INTERRUPTED
 from study.config import BadInputError
 from study.intake import planned_results, take_in
 from study.plan import make_plan
 from study.result import load_results
-from study.sweep import EXIT_INTERRUPTED, main
+from study.sweep import main
 from study.tracking import Tracker
 
 PLAN = (

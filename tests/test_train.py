@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 
 import study.cell  # noqa: F401 - torch is loaded now, so that the limit ends a training and not the import
-from study.command import Parser
+from study.command import EXIT_FAILED, Parser
 from study.config import BadInputError
 from study.plan import add_plan_options, given_plan
 from study.result import load_results
 from study.tracking import Tracker
-from study.train import EXIT_AGAIN, EXIT_FAILED, main
+from study.train import EXIT_AGAIN, main
 
 ROOT = Path(__file__).parent.parent
 SWEEP = ["heads", "--heads", "[rec,full]", "--policy_seeds", "2"]
