@@ -56,7 +56,7 @@ def test_scores_stand_side_by_side_with_the_difference_and_its_interval(pair, te
     shift = second.accuracy.mean - first.accuracy.mean
     assert cells[1] == f"{100 * first.accuracy.mean:.2f} (15)"
     assert cells[3] == f"\N{MINUS SIGN}{-100 * shift:.2f}"
-    found = difference(first.accuracy, second.accuracy, same_data=True)
+    found = difference(first.accuracy, second.accuracy)
     assert found.low < shift < found.high < 0
 
 
@@ -69,12 +69,13 @@ def test_an_order_that_changed_and_verdicts_that_changed_are_named(text):
     assert row(text, "**H2**")[2].startswith("**not reproduced**")
 
 
-def test_seeds_are_paired_on_the_same_frames_only(pair):
+def test_the_same_seeds_are_paired_and_others_are_two_samples(pair):
     first, second = (one.scores[0].accuracy for one in pair)
-    assert "paired" in difference(first, second, same_data=True).kind
-    assert "Welch" in difference(first, second, same_data=False).kind
-    fewer = second.model_copy(update={"units": {0: 0.8, 1: 0.9}})
-    assert "Welch" in difference(first, fewer, same_data=True).kind
+    assert "paired" in difference(first, second).kind
+    shifted = second.model_copy(update={"units": {seed + 1: value for seed, value in second.units.items()}})
+    assert "Welch" in difference(first, shifted).kind
+    over_encoders = second.model_copy(update={"kind": "t, over encoder seeds"})
+    assert "Welch" in difference(first, over_encoders).kind
 
 
 def test_a_sweep_beside_itself_differs_in_nothing(pair):
