@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 
 from study import stats
-from study.config import HEAD_SETS, Grid
+from study.config import HEAD_SETS, Grid, Rules
 from study.result import CellResult, SweepRecord
 from study.stats import ACCURACY, STEERING, Estimate, Panel, Point
 
@@ -185,17 +185,37 @@ def _episodes(record: SweepRecord, first: Point, second: Point) -> Estimate:
 # --- verdicts -------------------------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
 class Evidence:
-    """What the rules look at: the panels of a record, read once."""
+    """What the rules look at: curves of accuracy and steering loss by head set and fraction.
 
-    def __init__(self, record: SweepRecord) -> None:
-        table = record.table()
-        self.record, self.grid, self.rules = record, record.grid, record.grid.rules
-        self.accuracy = stats.panel(table, ACCURACY)
-        self.steering = stats.panel(table, STEERING)
-        self.top = max(self.grid.fractions)
-        self.heads = [name for name in HEAD_SETS if name in self.grid.heads]
-        self.rec = ("rec", self.top)  # what the text's claims compare with
+    `floor` is the steering loss of the best constant command.
+    """
+
+    grid: Grid
+    accuracy: Panel
+    steering: Panel
+    floor: float
+
+    @property
+    def rules(self) -> Rules:
+        """The sweep file's rules."""
+        return self.grid.rules
+
+    @property
+    def top(self) -> float:
+        """The largest fraction."""
+        return max(self.grid.fractions)
+
+    @property
+    def heads(self) -> list[str]:
+        """Head sets in the order of the study."""
+        return [name for name in HEAD_SETS if name in self.grid.heads]
+
+    @property
+    def rec(self) -> Point:
+        """What the text's claims compare with."""
+        return ("rec", self.top)
 
     def allowance(self, *points: Point) -> float:
         """Added to an interval's ends when its cells have one encoder each."""
@@ -208,7 +228,13 @@ class Evidence:
 
 def judge(record: SweepRecord) -> list[Verdict]:
     """A verdict on each claim of PAPER.md section 3, in its order; those that the sweep cannot test say so."""
-    evidence = Evidence(record)
+    table, base = record.table(), ("rec", max(record.grid.fractions))
+    floor = steering_floor(record, base) if results_at(record, base) else math.nan
+    return weigh(Evidence(record.grid, stats.panel(table, ACCURACY), stats.panel(table, STEERING), floor))
+
+
+def weigh(evidence: Evidence) -> list[Verdict]:
+    """A verdict on each claim from the curves alone."""
     return [_verdict(claim, evidence) for claim in CLAIMS]
 
 
@@ -287,7 +313,7 @@ def _above(evidence: Evidence, pairs: Iterable[tuple[Point, Point]]) -> list[Fin
 def _same_steering(evidence: Evidence, points: Sequence[Point]) -> list[Finding]:
     """Steering losses differ from the baseline's by less than the margin (two one-sided tests)."""
     rules, base = evidence.rules, evidence.rec
-    margin = rules.steering_margin * steering_floor(evidence.record, base)
+    margin = rules.steering_margin * evidence.floor
     others = [point for point in points if point != base]
     findings = []
     for point in others:
@@ -319,14 +345,15 @@ def _reach(evidence: Evidence, shares: Mapping[Point, float]) -> list[Finding]:
     """The mean curve reaches the baseline's final accuracy by the epoch that the text names, and some slack."""
     base = evidence.accuracy[evidence.rec]
     mean, goal = base.mean().to_numpy(), float(stats.final(base).mean())
+    own = stats.epochs_to_reach(base, base)
     findings = []
     for point, share in shares.items():
         curves = evidence.accuracy[point]
         bound = (share + evidence.rules.reach_slack) * curves.shape[1]
         found, more = stats.epochs_to_reach(curves, base), evidence.allowance(point, evidence.rec)
         in_time = found.high <= bound
-        # The baseline itself, were its encoder better by the allowance, must not be as fast: else speed shows nothing.
-        distinct = in_time and goal - mean[int(found.high) - 1] > more
+        # The baseline itself, even were its encoder better by the allowance, must be slower: else speed shows nothing.
+        distinct = in_time and own.low > found.high and goal - mean[int(found.high) - 1] > more
         behind = float(curves.mean().iloc[: max(int(bound), 1)].max()) + more < goal
         findings.append(
             Finding(
@@ -409,7 +436,8 @@ def _reach_rule(evidence: Evidence) -> str:
     rules = evidence.rules
     return (
         f"The upper end of the epoch's interval is at most the text's epoch and {rules.reach_slack * 100:g} % of all "
-        f"epochs. With one encoder for each cell, rec must then still be {rules.encoder_allowance * 100:.1f} points "
+        "epochs, and below the interval of the epoch at which rec itself reaches its final. With one encoder for each "
+        f"cell, rec must then still be {rules.encoder_allowance * 100:.1f} points "
         "below its final, so that a copy of rec with a luckier encoder would not pass."
     )
 

@@ -189,7 +189,17 @@ Fraction = Annotated[float, Field(gt=0, le=1)]
 
 
 class Rules(Settings):
-    """When a claim counts as reproduced, decided before the run (PAPER.md section 3; used by `study.claims`)."""
+    """When a claim counts as reproduced, decided before the run (PAPER.md section 3; used by `study.claims`).
+
+    Three of them stand for what a study of one encoder a cell cannot see; a run of several (`heads-encoders`) checks
+    them. With s the sd over encoders of one head set (the report's variance components, pooled over head sets), two
+    encoders differ by sqrt(2) s, and the largest of a claim's three contrasts by up to 3.4 s at 0.05 (of one: 2.8 s).
+    So `encoder_allowance` should be at least 3.4 s of final accuracy, 3.4 s of final steering loss should be well below
+    `steering_margin`, and `spread_factor` at least exp(3.4 s) with s that of the log of the variance over P policies,
+    whose square is smaller than what is found by 2 / (P - 1), the part of chance: this needs P = 10 or more.
+    Found with 14 encoders at half the data of `laptop`: s = 0.27 points, so 0.9 are needed and 1.0 are allowed;
+    steering 0.05e-3 against a margin of 0.24e-3; their 3 policies each cannot tell the last.
+    """
 
     alpha: Annotated[float, Field(gt=0, lt=0.5)] = Field(0.05, description="error rate of a claim's contrasts together")
     accuracy_margin: NotNegative = Field(0.005, description="smallest difference in accuracy that matters")

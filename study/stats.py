@@ -28,6 +28,7 @@ ACCURACY, STEERING = "acceleration_accuracy", "steering_loss"
 LAST = 5  # epochs whose mean is a final score (Sec. V-B)
 LEVEL = 0.95
 DRAWS = 10_000  # bootstrap resamples
+BCA = "BCa bootstrap at the expanded level, over policy seeds"
 EXACT = 20  # pairs up to which every flip of signs is counted
 
 
@@ -59,7 +60,8 @@ def panel(table: pd.DataFrame, metric: str, split: str = "test", stage: str = "p
     part = table[(table["metric"] == metric) & (table["split"] == split) & (table["stage"] == stage)]
     found: Panel = {}
     for (heads, fraction), rows in part.groupby(["heads", "fraction"], sort=False):
-        wide = rows.pivot_table(index=["encoder_seed", "policy_seed"], columns="epoch", values="value", dropna=False)
+        seeds = rows.set_index(["encoder_seed", "policy_seed", "epoch"])["value"]
+        wide = seeds.unstack("epoch")  # noqa: PD010 - pivot_table would take means of single values, for ten times as long
         found[str(heads), float(str(fraction))] = wide.astype(np.float64).sort_index().sort_index(axis=1)
     return found
 
@@ -166,20 +168,36 @@ def bca_limits(point: float, draws: Array, jackknife: Array, level: float = LEVE
     return float(low), float(high)
 
 
+def expanded(n: int, level: float = LEVEL) -> float:
+    """The level at which a bootstrap of n values is read so that it covers as often as `level` says (Hesterberg 2015).
+
+    A resample's spread is too small by sqrt((n - 1) / n), and its tails are the normal's instead of Student's. At most
+    what the number of resamples can tell.
+    """
+    tail = scipy_stats.norm.cdf(math.sqrt(n / (n - 1)) * scipy_stats.t.ppf((1 - level) / 2, n - 1))
+    return 1 - 2 * max(float(tail), 1 / DRAWS)
+
+
 def bootstrap(
     values: Array,
     statistic: Callable[[Array], Array] = lambda sample: sample.mean(axis=-1),
     level: float = LEVEL,
     purpose: str = "bootstrap",
 ) -> Estimate:
-    """BCa interval of a statistic of independent values [n]; the statistic reduces the last axis."""
+    """BCa interval of a statistic of independent values [n]; the statistic reduces the last axis.
+
+    Read at the expanded level: of 15 values from a normal, t5 and skewed (lognormal, 0.5) distribution it covers the
+    mean 95, 93 and 93 times in a hundred, without it 92, 90 and 90; of 5 values 92, 90 and 89, where Student's t does
+    95, 95 and 91.
+    """
     n = len(values)
     point = float(statistic(values))
     if n < 2:
         return Estimate(point, math.nan, math.nan, n, "no interval from one value", level)
     draws = statistic(values[generator(purpose).integers(n, size=(DRAWS, n))])
     left_out = statistic(np.stack([np.delete(values, index) for index in range(n)]))
-    return Estimate(point, *bca_limits(point, draws, left_out, level), n, "BCa bootstrap, over policy seeds", level)
+    low, high = bca_limits(point, draws, left_out, expanded(n, level))
+    return Estimate(point, low, high, n, BCA, level)
 
 
 def interquartile_mean(values: Array) -> Array:
@@ -200,7 +218,12 @@ def mean_interval(values: pd.Series, level: float = LEVEL) -> Estimate:
 
 
 def hierarchical(values: pd.Series, level: float = LEVEL) -> Estimate:
-    """Percentile interval of the mean when encoders, and then the policies on each, are drawn anew."""
+    """Percentile interval of the mean when encoders, and then the policies on each, are drawn anew.
+
+    With 5 encoders of 3 policies it covers the mean 81 times in a hundred where all the spread is between encoders, 91
+    where both levels spread alike, and 97 where none is (15 encoders of one policy: 93). Student's t over the encoders'
+    means covers 95 in each of these, so verdicts use that.
+    """
     rows = [group.to_numpy(np.float64) for _, group in values.groupby(level="encoder_seed")]
     rng = generator("hierarchical")
     means = np.empty((DRAWS, len(rows)))
@@ -356,10 +379,10 @@ def epochs_to_reach(curves: pd.DataFrame, baseline: pd.DataFrame, last: int = LA
     return Estimate(value, float(low), float(high), units, "percentile bootstrap of the mean curve, over seeds")
 
 
-def _resampled(curves: pd.DataFrame, rng: np.random.Generator, draws: int = DRAWS // 5) -> Array:
+def _resampled(curves: pd.DataFrame, rng: np.random.Generator) -> Array:
     """Weights [draws, seeds] of a mean over resampled encoders and policies."""
     encoder = pd.factorize(curves.index.get_level_values("encoder_seed"))[0]
-    count = int(encoder.max()) + 1
+    count, draws = int(encoder.max()) + 1, DRAWS // 5
     weights = np.zeros((draws, len(curves)))
     times = rng.multinomial(count, np.full(count, 1 / count), size=draws) if count > 1 else np.ones((draws, 1))
     for index in range(count):
@@ -409,11 +432,14 @@ def transient(baseline: pd.DataFrame, share: float = 0.95) -> int:
 def spread_ratio(first: pd.DataFrame, second: pd.DataFrame, epochs: int, level: float = LEVEL) -> Estimate:
     """Ratio of the variances over policy seeds of one encoder, each a mean over the first epochs.
 
-    With one encoder a BCa interval over policy seeds, resampled together in both; with several the geometric mean over
-    encoders of each one's ratio, and a t interval over them.
+    With one encoder Student's interval of the jackknife's pseudo-values of the log ratio (Miller 1968), policies left
+    out together in both; with several the geometric mean over encoders of each one's ratio, and a t interval over them.
+    With 15 policies that spread like the laptop profile's it covers 97 times in a hundred at 95 %, 98.4 at 98.3 %.
     """
-    both = first.index.intersection(second.index)
-    a, b = (_by_policy(frame.loc[both].iloc[:, :epochs]) for frame in (first, second))
+    if not first.index.equals(second.index):
+        both = first.index.intersection(second.index)
+        first, second = first.loc[both], second.loc[both]
+    a, b = (_by_policy(frame.iloc[:, :epochs]) for frame in (first, second))
     count, seeds = a.shape[:2]
     if seeds < (2 if count > 1 else 3):
         return Estimate(math.nan, math.nan, math.nan, seeds, "no interval from so few policies on an encoder", level)
@@ -422,10 +448,9 @@ def spread_ratio(first: pd.DataFrame, second: pd.DataFrame, epochs: int, level: 
     if count > 1:
         low, high = (float(end) for end in t_limits(ratios, level))
         return Estimate(math.exp(whole), math.exp(low), math.exp(high), count, "t, over encoder seeds", level)
-    draws = generator("spread").multinomial(seeds, np.full(seeds, 1 / seeds), size=DRAWS // 5).astype(np.float64)
-    left_out = 1.0 - np.eye(seeds)
-    low, high = bca_limits(whole, _log_ratio(a, b, draws)[0], _log_ratio(a, b, left_out)[0], level)
-    return Estimate(math.exp(whole), math.exp(low), math.exp(high), seeds, "BCa bootstrap, over policy seeds", level)
+    left_out = _log_ratio(a, b, 1.0 - np.eye(seeds))[0]
+    low, high = (float(end) for end in t_limits(seeds * whole - (seeds - 1) * left_out, level))
+    return Estimate(math.exp(whole), math.exp(low), math.exp(high), seeds, "jackknife t, over policy seeds", level)
 
 
 def _by_policy(frame: pd.DataFrame) -> Array:
@@ -443,9 +468,7 @@ def _log_ratio(first: Array, second: Array, counts: Array) -> Array:
     def variance(values: Array) -> Array:
         share = counts / counts.sum(axis=1, keepdims=True)
         centred = values - values.mean(axis=1, keepdims=True)
-        mean = np.einsum("ds,est->edt", share, centred)
-        square = np.einsum("ds,est->edt", share, centred**2)
-        return np.asarray((square - mean**2).mean(axis=2))
+        return np.asarray((share @ centred**2 - (share @ centred) ** 2).mean(axis=2))
 
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(np.log(variance(first)) - np.log(variance(second)))

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pandas as pd
 
+from study.claims import Evidence
 from study.config import HEAD_SETS, Grid, StudySettings
 from study.result import CURVE_COLUMNS, NO_SEED, CellResult, SweepRecord
 
@@ -37,15 +38,6 @@ class World:
     ceiling: float = 0.97  # accuracy of policies on the true state
 
 
-NULL = World(
-    accuracy=dict.fromkeys(HEAD_SETS, 0.835),
-    time=dict.fromkeys(HEAD_SETS, 28.0),
-    spread=dict.fromkeys(HEAD_SETS, 0.02),
-    by_fraction=0.0,
-    slower=0.0,
-    encoder_sd=0.0035,
-)
-
 HEADS_GRID = Grid(
     name="heads", title="Effect of different heads", heads=tuple(HEAD_SETS), claims=("H1", "H2", "H3", "H4", "H5")
 )
@@ -56,6 +48,73 @@ DATASIZE_GRID = Grid(
     fractions=(1.0, 0.5, 0.25, 0.125, 0.0625),
     claims=("D1", "D2", "D3", "D4"),
 )
+
+
+# --- null studies: every cell is a copy of rec ----------------------------------------------------------------------
+
+# Accuracy and steering loss of rec by epoch, as the laptop profile's `heads` has them (reports/reference/heads).
+REC_EPOCHS = np.array([1, 2, 5, 10, 20, 50, 100])
+REC_ACCURACY = np.array([0.674, 0.720, 0.756, 0.792, 0.8076, 0.8284, 0.846])
+FAST_ACCURACY = np.array([0.674, 0.74, 0.80, 0.835, 0.8455, 0.846, 0.846])  # of a copy that is done after 20 epochs
+REC_STEERING = np.array([2.7, 2.3, 1.73, 1.21, 0.79, 0.43, 0.27]) * 1e-3
+STEERING_FLOOR = 0.00482  # loss of the best constant command there
+
+
+@dataclass(frozen=True)
+class Null:
+    """Spread of a copy of rec, as sd of accuracy unless said so; for policies and epochs the laptop profile's.
+
+    A policy's deviation is its start, gone after a few epochs; a slow wander (correlation 0.95 from epoch to epoch);
+    and noise of each epoch. Steering losses go with their policy seed in all cells (r = 0.8), accuracies do not (0.0).
+    `encoder` is what an encoder's seed does to all its policies, test drives that it happens to suit among it;
+    `encoder_steering` the same for the log of the steering loss.
+    """
+
+    encoder: float = 0.0
+    encoder_steering: float = 0.0
+    spread: float = 0.0  # sd over encoders of the log of their policies' sd
+    start: float = 0.03
+    wander: float = 0.003
+    epoch: float = 0.0013
+    steering: float = 0.08  # sd over policies of the log of the steering loss
+    epochs: int = 100
+    fast: bool = False
+
+    def mean_curve(self):
+        """Accuracy by epoch without any spread."""
+        curve = FAST_ACCURACY if self.fast else REC_ACCURACY
+        return np.interp(np.log(np.arange(1, self.epochs + 1)), np.log(REC_EPOCHS), curve)
+
+    def evidence(self, grid, seed):
+        """What `study.claims` looks at, of a study of that grid."""
+        rng = np.random.default_rng(seed)
+        epoch = np.arange(1, self.epochs + 1)
+        mean, loss = self.mean_curve(), np.interp(np.log(epoch), np.log(REC_EPOCHS), REC_STEERING)
+        shape = (grid.encoder_seeds, grid.policy_seeds)
+        shared = rng.normal(size=shape)
+        index = pd.MultiIndex.from_product([range(n) for n in shape], names=["encoder_seed", "policy_seed"])
+        accuracy, steering = {}, {}
+        for point in {(cell.heads, cell.fraction): None for cell in grid.cells()}:
+            own = rng.normal(size=(*shape, self.epochs))
+            slow = np.empty_like(own)
+            slow[..., 0] = own[..., 0]
+            for k in range(1, self.epochs):
+                slow[..., k] = 0.95 * slow[..., k - 1] + np.sqrt(1 - 0.95**2) * own[..., k]
+            start = rng.normal(size=(*shape, 1)) * np.exp(-(epoch - 1) / 1.5)
+            wide = np.exp(self.spread * rng.normal(size=(shape[0], 1, 1)))
+            shift = self.encoder * rng.normal(size=(shape[0], 1, 1))
+            noise = self.epoch * rng.normal(size=own.shape)
+            values = mean + shift + wide * (self.start * start + self.wander * slow) + noise
+            log = np.sqrt(0.8) * shared + np.sqrt(0.2) * rng.normal(size=shape)
+            log = self.steering * log + self.encoder_steering * rng.normal(size=(shape[0], 1))
+            losses = loss * np.exp(log[..., None] + 0.05 * rng.normal(size=own.shape))
+            accuracy[point], steering[point] = (
+                pd.DataFrame(part.reshape(-1, self.epochs), index=index, columns=epoch) for part in (values, losses)
+            )
+        return Evidence(grid, accuracy, steering, STEERING_FLOOR)
+
+
+# --- records --------------------------------------------------------------------------------------------------------
 
 
 def _rows(seeds, stage, split, metric, values):

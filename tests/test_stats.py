@@ -4,16 +4,19 @@ import math
 import numpy as np
 import pandas as pd
 import pytest
+import scipy.special
 import statsmodels.api as sm
 from scipy import stats as scipy_stats
+from sklearn import linear_model, metrics, preprocessing
 from statsmodels.stats.multitest import multipletests
 from statsmodels.stats.power import TTestPower
-from statsmodels.stats.weightstats import ttost_paired
+from statsmodels.stats.weightstats import CompareMeans, DescrStatsW, ttost_paired
 
-from simulated import DATASIZE_GRID, HEADS_GRID, World, simulate
+from simulated import DATASIZE_GRID, HEADS_GRID, Null, World, simulate
 from study import stats
 from study.result import TABLE_COLUMNS
 
+PAIR = HEADS_GRID.model_copy(update={"heads": ("rec", "full")})
 DIFFERENCES = np.array([0.4, -0.1, 0.9, 0.3, 1.4, -0.6, 0.8, 0.2])
 
 
@@ -94,28 +97,38 @@ def test_bca_limits_are_scipys_on_its_own_draws():
     assert ours == pytest.approx(tuple(theirs.confidence_interval), abs=1e-3)
 
 
-def test_the_bootstrap_is_near_scipys_and_the_same_each_time():
-    ours = stats.bootstrap(DIFFERENCES)
-    theirs = scipy_stats.bootstrap((DIFFERENCES,), np.mean, n_resamples=20_000, method="BCa", rng=2).confidence_interval
-    assert (ours.low, ours.high) == pytest.approx((theirs.low, theirs.high), abs=0.02)
-    assert ours == stats.bootstrap(DIFFERENCES)
+@pytest.mark.parametrize("statistic", [np.mean, np.median, stats.interquartile_mean])
+def test_the_bootstrap_is_near_scipys_at_the_expanded_level_and_the_same_each_time(statistic):
+    def reduce(sample, axis=-1):
+        return statistic(
+            np.moveaxis(sample, axis, -1), **({} if statistic is stats.interquartile_mean else {"axis": -1})
+        )
+
+    values = np.random.default_rng(5).normal(size=15)
+    ours = stats.bootstrap(values, reduce)
+    level = stats.expanded(15)
+    theirs = scipy_stats.bootstrap(
+        (values,), reduce, n_resamples=20_000, method="BCa", confidence_level=level, rng=2
+    ).confidence_interval
+    assert (ours.low, ours.high) == pytest.approx((theirs.low, theirs.high), abs=0.03)
+    assert ours == stats.bootstrap(values, reduce)
+
+
+@pytest.mark.parametrize("n", [5, 15, 200])
+def test_the_expanded_level_makes_a_normal_bootstrap_as_long_as_students_interval(n):
+    values = np.random.default_rng(n).normal(size=n)
+    low, high = scipy_stats.norm.interval(stats.expanded(n), values.mean(), values.std(ddof=0) / math.sqrt(n))
+    assert (low, high) == pytest.approx(stats.t_limits(values))
+
+
+def test_two_values_have_an_interval_that_ends_at_them():
+    found = stats.bootstrap(np.array([1.0, 2.0]))
+    assert (found.low, found.high) == (1, 2)
 
 
 def test_equal_values_have_an_interval_of_no_length():
     found = stats.bootstrap(np.full(5, 0.25))
     assert (found.low, found.value, found.high) == (0.25, 0.25, 0.25)
-
-
-@pytest.mark.parametrize("n", [5, 15])
-def test_intervals_cover_the_truth_about_as_often_as_they_say(n):
-    rng = np.random.default_rng(3)
-    draws = 300
-    samples = rng.normal(1.0, 0.3, (draws, n))
-    t = [stats.t_limits(sample) for sample in samples]
-    assert np.mean([low <= 1 <= high for low, high in t]) == pytest.approx(0.95, abs=0.04)
-    if n == 15:  # a bootstrap of few values is too short, which is why design B uses t
-        bca = [stats.bootstrap(sample) for sample in samples]
-        assert np.mean([item.low <= 1 <= item.high for item in bca]) == pytest.approx(0.93, abs=0.04)
 
 
 def test_the_interquartile_mean_drops_a_quarter_on_either_side():
@@ -141,6 +154,33 @@ def test_variance_components_are_those_that_made_the_data():
     found = stats.variance_components(frame(values.reshape(1000, 5), encoders=200))
     assert found == pytest.approx({"encoder": 0.3, "policy": 0.2, "epoch": 0.1}, rel=0.12)
     assert math.isnan(stats.variance_components(frame(values[0]))["encoder"])
+
+
+def test_variance_components_are_those_of_a_mixed_model():
+    rng = np.random.default_rng(4)
+    values = rng.normal(0, 3, (8, 1, 1)) + rng.normal(0, 2, (8, 4, 1)) + rng.normal(0, 1, (8, 4, 5))
+    rows = pd.DataFrame(
+        [(i, j, value) for i, j, k in np.ndindex(8, 4, 5) for value in [values[i, j, k]]],
+        columns=["encoder", "policy", "value"],
+    )
+    fit = sm.MixedLM.from_formula(
+        "value ~ 1", rows, groups="encoder", re_formula="1", vc_formula={"policy": "0 + C(policy)"}
+    ).fit()
+    theirs = np.sqrt([fit.cov_re.iloc[0, 0], fit.vcomp[0], fit.scale])
+    assert list(stats.variance_components(frame(values.reshape(32, 5), encoders=8)).values()) == pytest.approx(
+        theirs, rel=1e-3
+    )
+
+
+def test_the_hierarchical_bootstrap_is_the_plain_loops():
+    rng = np.random.default_rng(6)
+    values = rng.normal(0, 1, (5, 1)) + rng.normal(0, 0.5, (5, 3))
+    ours = stats.hierarchical(stats.final(frame(values.reshape(15, 1), encoders=5), last=1))
+    means = [np.mean([rng.choice(values[encoder], 3).mean() for encoder in rng.choice(5, 5)]) for _ in range(4000)]
+    assert (ours.low, ours.high) == pytest.approx(np.quantile(means, [0.025, 0.975]), abs=0.08)
+    nested = values.mean(axis=1).var() / 5 + values.var(axis=1).mean() / 15  # what such means vary by
+    assert np.var(means) == pytest.approx(nested, rel=0.1)
+    assert ours.high - ours.low == pytest.approx(2 * 1.96 * math.sqrt(nested), rel=0.1)
 
 
 # --- comparisons ----------------------------------------------------------------------------------------------------
@@ -189,6 +229,16 @@ def test_equivalence_is_statsmodels(margin):
     assert stats.equivalence(DIFFERENCES, margin) == pytest.approx(theirs)
 
 
+def test_two_samples_and_pairs_are_statsmodels():
+    other = np.array([0.1, 0.5, -0.4, 0.2, 0.3])
+    ours = stats.welch(list(DIFFERENCES), list(other))
+    theirs = CompareMeans(DescrStatsW(DIFFERENCES), DescrStatsW(other)).tconfint_diff(usevar="unequal")
+    assert (ours.low, ours.high) == pytest.approx(theirs)
+    pairs = stats.paired_t(list(DIFFERENCES))
+    assert (pairs.low, pairs.high) == pytest.approx(DescrStatsW(DIFFERENCES).tconfint_mean())
+    assert math.isnan(stats.welch([1.0], [2.0, 3.0]).low)
+
+
 def test_only_seeds_that_both_have_are_paired():
     first, second = frame([[1.0], [2.0], [3.0]])[1], frame([[1.0], [1.0]])[1]
     assert stats.paired(first, second).tolist() == [0, 1]
@@ -212,6 +262,21 @@ def test_epochs_to_reach_follow_the_mean_curve_and_lie_in_their_interval():
     assert full.mean()[found.value] >= stats.final(rec).mean() > full.mean()[found.value - 1]
     assert found.low <= found.value <= found.high
     assert found.value < stats.epochs_to_reach(rec, rec).value
+
+
+def test_the_interval_of_epochs_to_reach_is_the_plain_loops():
+    record = simulate(HEADS_GRID.model_copy(update={"encoder_seeds": 4, "policy_seeds": 3}))
+    curves = stats.panel(record.table(), stats.ACCURACY)
+    rec, full = curves["rec", 1.0], curves["full", 1.0]
+    slow, fast = (curve.to_numpy().reshape(4, 3, -1) for curve in (rec, full))
+    rng, epochs = np.random.default_rng(0), []
+    for _ in range(1500):
+        seeds = [(encoder, policy) for encoder in rng.choice(4, 4) for policy in rng.choice(3, 3)]
+        goal = np.mean([slow[seed][-5:] for seed in seeds])
+        above = np.mean([fast[seed] for seed in seeds], axis=0) >= goal
+        epochs.append(above.argmax() + 1 if above.any() else np.inf)
+    found = stats.epochs_to_reach(full, rec)
+    assert (found.low, found.high) == pytest.approx(np.quantile(epochs, [0.025, 0.975]), abs=1)
 
 
 def test_a_curve_that_never_reaches_is_infinite_and_so_is_its_interval():
@@ -238,6 +303,7 @@ def test_the_median_epoch_is_kaplan_meiers():
         theirs = sm.SurvfuncRight(times, np.isfinite(found.epochs)).quantile(0.5)
         assert found.median == theirs
         assert found.share == reached / len(rows)
+        assert found.area == pytest.approx(np.maximum(16 - epochs, 0).sum() / rows.size)
 
 
 def test_the_variance_ratio_finds_the_noisier_curves():
@@ -248,6 +314,20 @@ def test_the_variance_ratio_finds_the_noisier_curves():
     assert found.low > 4
     back = stats.spread_ratio(frame(quiet), frame(loud), epochs=20)
     assert back.value == pytest.approx(1 / found.value)
+
+
+def test_the_variance_ratio_is_numpys_and_its_interval_the_jackknifes():
+    rng = np.random.default_rng(8)
+    loud, quiet = rng.normal(0, 2, (15, 30)), rng.normal(0, 1, (15, 30))
+
+    def log_ratio(keep):
+        return math.log(np.var(loud[keep, :20], axis=0).mean() / np.var(quiet[keep, :20], axis=0).mean())
+
+    everyone = list(range(15))
+    pseudo = [15 * log_ratio(everyone) - 14 * log_ratio([k for k in everyone if k != out]) for out in everyone]
+    found = stats.spread_ratio(frame(loud), frame(quiet), epochs=20)
+    assert math.log(found.value) == pytest.approx(log_ratio(everyone))
+    assert np.log([found.low, found.high]) == pytest.approx(DescrStatsW(pseudo).tconfint_mean())
 
 
 def test_the_transient_ends_when_most_of_the_rise_is_done():
@@ -271,6 +351,21 @@ def test_recall_and_f1_of_a_known_table():
     assert np.diag(stats.confusion(guess, label)[0]).tolist() == [0.75, 1, 0.5]
     f1 = np.mean([2 * 3 / (4 + 4), 2 * 2 / (3 + 2), 2 * 1 / (1 + 2)])
     assert stats.macro_f1(guess, label) == pytest.approx([f1])
+
+
+def test_recall_and_f1_are_scikit_learns():
+    rng = np.random.default_rng(3)
+    label, guess = rng.integers(0, 3, 200).astype(np.uint8), rng.integers(0, 3, (4, 200)).astype(np.uint8)
+    theirs = [metrics.confusion_matrix(label, row, normalize="true") for row in guess]
+    np.testing.assert_allclose(stats.confusion(guess, label), theirs)
+    assert stats.macro_f1(guess, label) == pytest.approx(
+        [metrics.f1_score(label, row, average="macro") for row in guess]
+    )
+
+
+def test_the_steering_loss_is_scipys_huber():
+    error = np.linspace(-3, 3, 41)
+    np.testing.assert_allclose(stats.smooth_l1(error), scipy.special.huber(1, error))
 
 
 def test_accuracy_by_drive_gives_every_drive_the_same_weight():
@@ -300,6 +395,20 @@ def test_a_probe_finds_what_a_latent_holds_and_nothing_where_there_is_nothing():
     assert math.isnan(stats.probe(z, held, np.zeros(800, int)))
 
 
+def test_a_probe_is_scikit_learns_ridge_on_held_out_drives():
+    rng = np.random.default_rng(2)
+    z, drive = rng.normal(size=(300, 64)).astype(np.float32), np.arange(300) // 30
+    target = z[:, 0] + rng.normal(size=300)
+    x = preprocessing.StandardScaler().fit_transform(z.astype(float))
+    error = total = 0.0
+    for held in np.array_split(stats.generator("probe").permutation(10), 5):
+        test = np.isin(drive, held)
+        fit = linear_model.Ridge(alpha=1.0).fit(x[~test], target[~test])
+        error += ((target[test] - fit.predict(x[test])) ** 2).sum()
+        total += ((target[test] - target[~test].mean()) ** 2).sum()
+    assert stats.probe(z, target, drive) == pytest.approx(1 - error / total, rel=1e-4)
+
+
 def test_a_probe_does_not_profit_from_twins_in_the_same_drive():
     rng = np.random.default_rng(1)
     drive = np.arange(800) // 40
@@ -315,3 +424,93 @@ def test_principal_components_are_those_of_the_covariance():
     values = np.sort(np.linalg.eigvalsh(np.corrcoef(z.T)))[::-1]
     np.testing.assert_allclose(shares, (values / values.sum())[:2], rtol=1e-4)
     np.testing.assert_allclose(places.var(axis=0, ddof=0), values[:2], rtol=1e-3)
+
+
+# --- error rates over many draws ------------------------------------------------------------------------------------
+
+
+def near(rate, nominal, draws):
+    """Whether a rate over so many draws is the nominal one, give or take three standard errors."""
+    return abs(rate - nominal) < 3 * math.sqrt(nominal * (1 - nominal) / draws)
+
+
+def covers(intervals, truth):
+    return np.mean([low <= truth <= high for low, high in intervals])
+
+
+@pytest.mark.parametrize(("n", "expected"), [(5, 0.92), (15, 0.945)])
+def test_bca_intervals_cover_the_mean_about_as_often_as_they_say(n, expected, monkeypatch):
+    """Without the expanded level it would be 0.85 and 0.92; Student's interval is exact."""
+    monkeypatch.setattr(stats, "DRAWS", 1000)
+    samples = np.random.default_rng(3).normal(1.0, 0.3, (1000, n))
+    found = [stats.bootstrap(sample) for sample in samples]
+    assert near(covers([(item.low, item.high) for item in found], 1.0), expected, 1000)
+    low, high = stats.t_limits(samples.T)
+    assert near(np.mean((low <= 1) & (high >= 1)), 0.95, 1000)
+
+
+@pytest.mark.parametrize(
+    ("encoder", "policy", "expected"), [(1.0, 0.0, 0.81), (1.0, 1.0, 0.91), (0.0, 1.0, 0.965)], ids=str
+)
+def test_with_five_encoders_of_three_policies_t_keeps_its_level_and_the_bootstrap_does_not(
+    encoder, policy, expected, monkeypatch
+):
+    monkeypatch.setattr(stats, "DRAWS", 1000)
+    rng, nested, t = np.random.default_rng(1), [], []
+    for _ in range(400):
+        values = rng.normal(0, encoder, (5, 1)) + rng.normal(0, policy, (5, 3))
+        score = stats.final(frame(values.reshape(15, 1), encoders=5), last=1)
+        for kept, found in ((nested, stats.hierarchical(score)), (t, stats.mean_interval(score))):
+            kept.append((found.low, found.high))
+    assert near(covers(nested, 0), expected, 400)
+    assert near(covers(t, 0), 0.95, 400)
+
+
+@pytest.mark.parametrize(
+    ("grid", "null"),
+    [(PAIR, Null()), (PAIR.model_copy(update={"encoder_seeds": 5, "policy_seeds": 3}), Null(encoder=0.0035))],
+    ids=["15 policies", "5 encoders of 3 policies"],
+)
+def test_epochs_to_reach_and_variance_ratios_cover_the_truth(grid, null, monkeypatch):
+    """Curves with the laptop profile's spread; full is rec and two points, so its mean curve's epoch is known."""
+    monkeypatch.setattr(stats, "DRAWS", 2000)
+    truth = null.mean_curve() + 0.02
+    epoch = stats.first_reach(truth, truth[-stats.LAST :].mean() - 0.02)
+    epochs, ratios = [], []
+    for seed in range(150):
+        curves = null.evidence(grid, seed).accuracy
+        rec, full = curves["rec", 1.0], curves["full", 1.0] + 0.02
+        for kept, found in ((epochs, stats.epochs_to_reach(full, rec)), (ratios, stats.spread_ratio(rec, full, 60))):
+            kept.append((found.low, found.high))
+    assert 0.88 < covers(epochs, epoch) < 0.99
+    assert 0.88 < covers(ratios, 1.0) < 0.99
+
+
+def test_sign_flips_of_nothing_have_uniform_p_values():
+    rng = np.random.default_rng(0)
+    p_values = np.array([stats.sign_flip(sample) for sample in rng.standard_t(3, (2000, 10))])
+    for level in (0.01, 0.05, 0.25, 0.5, 0.9):
+        exact = math.floor(level * 2**9) / 2**9  # p is a multiple of 2 / 2^10
+        assert near(np.mean(p_values <= level), exact, 2000)
+
+
+def test_holm_keeps_the_family_wise_error_of_all_pairs_of_four():
+    rng, wrong = np.random.default_rng(1), 0
+    for _ in range(1000):
+        groups = rng.normal(0, 1, (4, 10))
+        p_values = [stats.sign_flip(a - b) for a, b in itertools.combinations(groups, 2)]
+        wrong += min(stats.holm(p_values)) <= 0.05
+    assert 0.01 < wrong / 1000 < 0.05 + 3 * math.sqrt(0.05 * 0.95 / 1000)
+
+
+def test_equivalence_at_the_margin_is_claimed_at_the_nominal_rate():
+    samples = np.random.default_rng(2).normal(0.5, 0.4, (2000, 15))
+    claimed = np.mean([stats.equivalence(sample, 0.5) <= 0.05 for sample in samples])
+    assert near(claimed, 0.05, 2000)
+
+
+def test_the_detectable_difference_is_found_four_times_in_five():
+    samples = np.random.default_rng(4).normal(0, 1, (2000, 15))
+    effect = stats.detectable(scipy_stats.zscore(np.arange(15.0), ddof=1))  # of values whose sd is 1
+    found = scipy_stats.ttest_1samp(samples + effect, 0, axis=1).pvalue <= 0.05
+    assert near(found.mean(), 0.8, 2000)
