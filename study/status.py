@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Literal
 
 from study.command import Parser
 from study.config import DEFAULT_TRACKING, masked
-from study.cost import cell_cost, clock
+from study.cost import CELL_START_S, cell_cost, clock
 from study.display import ENCODER_SHARE, STAGES, show_table
 from study.plan import Plan, add_plan_options, given_plan, look_up
 
@@ -133,7 +133,8 @@ def seconds_left(plan: Plan, cells: Sequence[CellStatus], now: float, *, frames_
         if cell.took is not None:
             expected, measured = expected + costs[cell.key], measured + cell.took
         if cell.state == "running" and cell.since is not None and cell.share > 0:
-            expected, measured = expected + costs[cell.key] * cell.share, measured + now - cell.since
+            begun = CELL_START_S + (costs[cell.key] - CELL_START_S) * cell.share
+            expected, measured = expected + begun, measured + now - cell.since
         if cell.state not in ("finished", "failed"):
             left += costs[cell.key] * (1 - (cell.share if cell.state == "running" else 0.0))
     at_a_time = max(1, sum(cell.state == "running" for cell in cells))
