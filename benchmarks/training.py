@@ -273,6 +273,21 @@ def encoder(heads: str, size: str, limits: Numbers) -> Numbers:
     }
 
 
+def encoders(limits: Numbers) -> Numbers:
+    """All configurations, and the worst of each ratio."""
+    found = []
+    for size, heads in itertools.product(BATCHES, ("rec", "full")):
+        found.append(encoder(heads, size, limits))
+        print(json.dumps(found[-1]), file=sys.stderr)  # it takes minutes: what is measured should not be lost
+    return {
+        "images_per_s": found[-1]["images_per_s"]["ours"]["median"],  # `full` at the paper's batch
+        "ratio_to_bare": min(each["ratio_to_bare"]["median"] for each in found),
+        "ratio_to_template": min(each["ratio_to_template"] for each in found),
+        "telling_share": max(each["telling_share"] for each in found),
+        "configurations": found,
+    }
+
+
 # --- memory ---------------------------------------------------------------------------------------------------------
 
 
@@ -429,6 +444,7 @@ def main() -> None:
     """Measure, print, and keep the result."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="try everything on almost no data; keep nothing")
+    parser.add_argument("--policies", action="store_true", help="only the policies; of the rest, keep the last result")
     parser.add_argument("--memory", metavar="PRECISION", help="measure the memory of training, as the others do")
     options = parser.parse_args()
     if options.quick:
@@ -438,22 +454,15 @@ def main() -> None:
     if options.memory:
         train_for_memory(options.memory)
         return
-    result: Numbers = {"machine": machine(), "limits": peaks(256 if options.quick else 2048)}
-    encoders = []
-    for size, heads in itertools.product(BATCHES, ("rec", "full")):
-        encoders.append(encoder(heads, size, result["limits"]))
-        print(json.dumps(encoders[-1]), file=sys.stderr)  # it takes minutes: what is measured should not be lost
-    result["encoder"] = {
-        "images_per_s": encoders[-1]["images_per_s"]["ours"]["median"],  # `full` at the paper's batch
-        "ratio_to_bare": min(each["ratio_to_bare"]["median"] for each in encoders),
-        "ratio_to_template": min(each["ratio_to_template"] for each in encoders),
-        "telling_share": max(each["telling_share"] for each in encoders),
-        "configurations": encoders,
-    }
+    if options.policies:
+        result: Numbers = json.loads(RESULT.read_text())
+    else:
+        result = {"machine": machine(), "limits": peaks(256 if options.quick else 2048)}
+        result["encoder"] = encoders(result["limits"])
+        result["memory_bytes"] = {precision: memory(precision) for precision in ("bf16", "fp32")}
     sizes = {size: policies(size, result["limits"]) for size in POLICY_FRAMES}
     worst = min(each["ratio_to_sequential"]["median"] for each in sizes.values())
-    result["policies"] = {"ratio_to_sequential": worst, **sizes}
-    result["memory_bytes"] = {precision: memory(precision) for precision in ("bf16", "fp32")}
+    result["policies"] = {"ratio_to_sequential": worst, "commit": machine()["commit"], **sizes}
     result["gpu"] = None  # not measured yet
     show(result)
     if not options.quick:

@@ -28,6 +28,7 @@ from study.policy import (
     dropped,
     forward_backward,
     initial_weights,
+    likeliest,
     measure,
     normalisation,
     normalise,
@@ -355,6 +356,11 @@ def test_metrics_agree_with_numpy() -> None:
     }
     for metric, values in zip(METRICS, got.numpy(), strict=True):
         np.testing.assert_allclose(values, expected[metric], rtol=1e-5, err_msg=metric)
+
+
+def test_of_equal_logits_the_first_class_counts() -> None:
+    logits = torch.tensor(list(itertools.product((-1.0, 0.0, 2.0), repeat=3))).T[None]
+    assert torch.equal(likeliest(logits), torch.from_numpy(logits.numpy().argmax(1)))
 
 
 def test_balanced_accuracy_is_over_the_classes_that_occur() -> None:
