@@ -23,7 +23,8 @@ def draw(record: SweepRecord, made: Numbers) -> list[Drawing]:
         own = [*_speed(record, made), *_fractions(made)]
     else:
         own = [_heads(record, made, "test", "main"), _heads(record, made, "train", "train")]
-    return [*own, *_differences(made), *_confounds(made), *_latents(record, made), *_pictures(record, made)]
+    own += [*_confusions(made), *_encoders(record, made), *_differences(made), *_confounds(made)]
+    return [*own, *_latents(record, made), *_pictures(record, made)]
 
 
 def _bands(made: Numbers) -> str:
@@ -162,6 +163,53 @@ def _differences(made: Numbers) -> list[Drawing]:
     ]
 
 
+def _encoders(record: SweepRecord, made: Numbers) -> list[Drawing]:
+    """How far policies differ by their encoder, at the largest fraction; with one encoder each there is nothing."""
+    if made["sweep"]["design"] == "A":
+        return []
+    top, curves = max(record.grid.fractions), stats.panel(record.table(), stats.ACCURACY)
+    scores = {
+        heads: [group.to_numpy(np.float64) for _, group in stats.final(frame).groupby(level="encoder_seed")]
+        for (heads, fraction), frame in curves.items()
+        if fraction == top
+    }
+    told = "; ".join(
+        f"{heads} from {100 * min(map(np.mean, each)):.1f} to {100 * max(map(np.mean, each)):.1f} %"
+        for heads, each in scores.items()
+    )
+    counts = sorted({(len(each), len(each[0])) for each in scores.values()})
+    over = " or ".join(f"n = {encoders} encoders x {policies} policies" for encoders, policies in counts)
+    return [
+        Drawing(
+            "by_encoder",
+            "encoders",
+            f"Final test accuracy (mean of the last {stats.LAST} epochs) of every policy, {over} for each head set. "
+            "Marks: policies; bars: mean of an encoder's policies; dashed: mean of the encoders.",
+            f"Strip chart of policies by encoder. Means of encoders: {told}.",
+            figures.by_encoder(scores),
+        )
+    ]
+
+
+def _confusions(made: Numbers) -> list[Drawing]:
+    """Confusion matrices of the head sets at the largest fraction."""
+    top = made["sweep"]["fractions"][0]
+    own = [score for score in made["scores"] if score["fraction"] == top]
+    told = "; ".join(
+        f"{score['cell']} " + ", ".join(f"{100 * score['confusion'][i][i]:.0f} %" for i in range(3)) for score in own
+    )
+    return [
+        Drawing(
+            "confusion",
+            "confusion",
+            "How often each true class of throttle \N{MINUS SIGN} brake is given each class on test frames [%], after "
+            f"the last epoch, mean over {_over(made)}.",
+            f"Confusion matrices. Recall of the classes \N{MINUS SIGN}1, 0.5 and 1: {told}.",
+            figures.confusions([(score["cell"], np.array(score["confusion"])) for score in own]),
+        )
+    ] * bool(own)
+
+
 def _confounds(made: Numbers) -> list[Drawing]:
     """Each confound's contrasts under both of its values."""
     drawings = []
@@ -197,7 +245,7 @@ def _latents(record: SweepRecord, made: Numbers) -> list[Drawing]:
         speed = own.get("speed")
         if speed is None:
             return []
-        maps.append((name, places, shares, speed, own["acceleration_label"]))
+        maps.append((name, places, shares, speed, own["light"], own["steering_label"]))
     encoders = "one encoder each" if made["sweep"]["encoder_seeds"] == 1 else "the first encoder of each"
     count = len(maps[0][1]) if maps else 0
     return [
@@ -205,9 +253,10 @@ def _latents(record: SweepRecord, made: Numbers) -> list[Drawing]:
             "latent_maps",
             "latents",
             f"Latents of the policy set's {count} test frames on their first two principal components (of z-scored "
-            f"dimensions; {encoders}), coloured by the vehicle's speed and by what the expert did.",
-            "Scatter plots of latents for each head set, coloured by speed in the first row and by the expert's "
-            "acceleration class in the second.",
+            f"dimensions; {encoders}), coloured by the vehicle's speed, the light that governs and the expert's "
+            "steering.",
+            "Scatter plots of latents for each head set, coloured by speed in the first row, by light in the second "
+            "and by steering in the third.",
             figures.latent_maps(maps),
         )
     ] * bool(maps)

@@ -27,7 +27,7 @@ LINE = {"rec": "-", "rec+pred": "-.", "rec+plan": "--", "full": "-"}
 MARKER = {"rec": "o", "rec+pred": "^", "rec+plan": "s", "full": "D"}
 FRACTION_COLOUR = ("#D55E00", "#E69F00", "#009E73", "#56B4E9", "#CC79A7")
 FRACTION_MARKER = ("D", "^", "s", "v", "P")
-CLASS_COLOUR = ("#0072B2", "#E69F00", "#009E73")  # of the acceleration classes
+LIGHT_COLOUR, LIGHT_WORDS = ("#BBBBBB", "#E69F00", "#D55E00"), ("green or none", "yellow", "red")
 GREY = "#666666"
 CEILING_LINE, CEILING_WORDS = ":", "true state"
 WIDTH = 6.4  # [in], the report's text width
@@ -342,6 +342,50 @@ def differences(rows: Sequence[Mapping[str, float | str]], allowance: float) -> 
     return figure
 
 
+def by_encoder(scores: Mapping[str, Sequence[NDArray[np.float64]]]) -> Figure:
+    """Final accuracy of every policy, encoder by encoder, and the means of encoders and head sets.
+
+    `scores`: for each head set, and each of its encoders, the scores of its policies.
+    """
+    with mpl.rc_context(STYLE):
+        figure, (axes,) = _figure(2.6)
+        place, ticks = 0, []
+        for heads, encoders in scores.items():
+            first = place
+            for policies in encoders:
+                axes.plot([place] * len(policies), 100 * policies, MARKER[heads], color=COLOUR[heads], alpha=0.5)
+                middle = 100 * float(policies.mean())
+                axes.hlines(middle, place - 0.35, place + 0.35, color=COLOUR[heads], linewidth=1.4)
+                place += 1
+            whole = 100 * float(np.mean([policies.mean() for policies in encoders]))
+            axes.hlines(whole, first - 0.5, place - 0.5, color=GREY, linewidth=0.7, linestyle="--")
+            ticks.append(((first + place - 1) / 2, heads))
+            place += 1
+        axes.set_xticks([tick for tick, _ in ticks], [f"{heads}\n(each column an encoder)" for _, heads in ticks])
+        axes.tick_params(axis="x", length=0)
+        axes.set_ylabel("acceleration accuracy, test [%]")
+    return figure
+
+
+def confusions(tables: Sequence[tuple[str, NDArray[np.float64]]]) -> Figure:
+    """Confusion matrices side by side, one for each name: share [3, 3] of each true class that is given each class."""
+    names = [f"{value:g}" for value in ACCELERATIONS]
+    with mpl.rc_context(STYLE):
+        figure, panels = _figure(1.9, columns=len(tables))
+        for panel, (name, table) in zip(panels, tables, strict=True):
+            panel.imshow(table, cmap="Greys", vmin=0, vmax=1)
+            for row, column in np.ndindex(*table.shape):
+                share = float(table[row, column])
+                colour = "white" if share > 0.5 else "black"
+                panel.text(column, row, f"{100 * share:.1f}", ha="center", va="center", color=colour, fontsize=7)
+            panel.set_xticks(range(len(names)), names)
+            panel.set_yticks(range(len(names)), names)
+            panel.set_xlabel("given")
+            panel.set_title(name)
+        panels[0].set_ylabel("true throttle \N{MINUS SIGN} brake")
+    return figure
+
+
 def both_values(rows: Sequence[Mapping[str, Any]], setting: str, values: tuple[str, str]) -> Figure:
     """Differences in accuracy [points] under two values of a setting, with their intervals.
 
@@ -371,41 +415,39 @@ def both_values(rows: Sequence[Mapping[str, Any]], setting: str, values: tuple[s
 
 # --- latents --------------------------------------------------------------------------------------------------------
 
-Map = tuple[str, NDArray[np.float64], NDArray[np.float64], NDArray[np.float32], NDArray[np.uint8]]
+Map = tuple[str, NDArray[np.float64], NDArray[np.float64], NDArray[np.float32], NDArray[np.uint8], NDArray[np.float32]]
 
 
 def latent_maps(maps: Sequence[Map], most: int = 1500) -> Figure:
-    """Two rows of scatter plots, one column for each head set: by speed, and by acceleration class.
+    """Three rows of scatter plots, one column for each head set: by speed, by light, and by steering.
 
-    Each map is a name, places [N, 2], their shares of the variance [2], speed [N] [m/s] and class [N]; at most `most`
-    evenly spread frames are drawn.
+    Each map is a name, places [N, 2], their shares of the variance [2], speed [N] [m/s], light [N] and steering [N];
+    at most `most` evenly spread frames are drawn.
     """
     with mpl.rc_context(STYLE):
-        figure, axes = _figure(3.4, columns=len(maps), rows=2)
-        for column, (name, places, shares, speed, kind) in enumerate(maps):
+        figure, axes = _figure(4.6, columns=len(maps), rows=3)
+        for column, (name, places, shares, speed, light, steering) in enumerate(maps):
             every = max(len(places) // most, 1)
             x, y = places[::every].T
-            above, below = axes[column], axes[len(maps) + column]
-            shown = above.scatter(x, y, c=speed[::every], s=3, cmap="cividis", vmin=0, linewidths=0, rasterized=True)
-            for index, command in enumerate(ACCELERATIONS):
-                here = kind[::every] == index
-                below.scatter(
-                    x[here],
-                    y[here],
-                    s=3,
-                    color=CLASS_COLOUR[index],
-                    linewidths=0,
-                    label=f"{command:g}",
-                    rasterized=True,
+            above, middle, below = axes[column :: len(maps)]
+            fast = above.scatter(x, y, c=speed[::every], s=3, cmap="cividis", vmin=0, linewidths=0, rasterized=True)
+            for index, word in enumerate(LIGHT_WORDS):
+                here = light[::every] == index
+                middle.scatter(
+                    x[here], y[here], s=3, color=LIGHT_COLOUR[index], linewidths=0, label=word, rasterized=True
                 )
+            turn = below.scatter(
+                x, y, c=steering[::every], s=3, cmap="RdYlBu", vmin=-0.2, vmax=0.2, linewidths=0, rasterized=True
+            )
             above.set_title(name)
             below.set_xlabel(f"{100 * shares[0]:.0f} + {100 * shares[1]:.0f} % of variance", fontsize=6.5)
         for panel in axes:
             panel.set_xticks([])
             panel.set_yticks([])
-        figure.colorbar(shown, ax=axes[len(maps) - 1], label="speed [m/s]")
-        axes[-1].legend(
-            title="throttle \N{MINUS SIGN} brake",
+        figure.colorbar(fast, ax=axes[len(maps) - 1], label="speed [m/s]")
+        figure.colorbar(turn, ax=axes[-1], label="steering, left above 0")
+        axes[2 * len(maps) - 1].legend(
+            title="light",
             loc="center left",
             bbox_to_anchor=(1.0, 0.5),
             frameon=False,
@@ -414,7 +456,8 @@ def latent_maps(maps: Sequence[Map], most: int = 1500) -> Figure:
             markerscale=2.5,
         )
         axes[0].set_ylabel("by speed")
-        axes[len(maps)].set_ylabel("by command")
+        axes[len(maps)].set_ylabel("by light")
+        axes[2 * len(maps)].set_ylabel("by steering")
     return figure
 
 

@@ -13,6 +13,7 @@ import pandas as pd
 
 from study import claims, confounds, stats
 from study.config import ACCELERATIONS, CEILING, HEAD_SETS, parameter_counts
+from study.cost import cell_cost, data_cost, total
 from study.result import CellResult, SweepRecord
 from study.stats import Estimate, Panel, Point
 
@@ -315,6 +316,7 @@ def _count(value: Any) -> Any:
 
 
 def _cost(record: SweepRecord) -> Numbers:
+    costs = [cell_cost(record.settings, cell, record.grid.policy_seeds) for cell in record.planned.values()]
     rows = []
     for key, cell in record.planned.items():
         if key not in record.results:
@@ -334,6 +336,7 @@ def _cost(record: SweepRecord) -> Numbers:
     return {
         "cells": rows,
         "seconds": sum(row["whole"] or 0.0 for row in rows),
+        "disk": total([data_cost(record.settings, recorded="writers" not in record.data), *costs]).bytes,
         "peak_bytes": max((row["peak_bytes"] or 0 for row in rows), default=None),
     }
 

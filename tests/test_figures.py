@@ -107,6 +107,9 @@ def test_picture_rows_place_a_picture_of_each_row_in_each_column():
     assert [text.get_text() for text in figure.texts] == ["input", "target"]
 
 
+ENCODERS_GRID = HEADS_GRID.model_copy(update={"heads": ("rec", "full"), "encoder_seeds": 3, "policy_seeds": 5})
+
+
 @pytest.mark.parametrize(
     ("grid", "names"),
     [
@@ -119,8 +122,10 @@ def test_picture_rows_place_a_picture_of_each_row_in_each_column():
                 "multi_results",
                 "latent_maps",
                 "all_head_sets",
+                "confusion",
             },
         ),
+        (ENCODERS_GRID, {"by_encoder"}),
         (DATASIZE_GRID, {"datasize_compare", "datasize_convergespeed"}),
     ],
 )
@@ -129,7 +134,8 @@ def test_a_sweep_gets_every_figure_of_the_paper_with_n_in_the_caption(grid, name
     drawings = {drawing.name: drawing for drawing in draw(record, numbers(record))}
     assert names <= set(drawings)
     for name in names - {"single_head_rec", "multi_results", "latent_maps", "all_head_sets"}:
-        assert "n = 15 policies" in drawings[name].caption
+        wanted = "n = 3 encoders x 5 policies" if name == "by_encoder" else "n = 15 policies"
+        assert wanted in drawings[name].caption
     assert all(drawing.alt for drawing in drawings.values())
 
 
