@@ -936,6 +936,16 @@ def paint_samples(module: MultiHeadAutoencoder, frames: Frames, rows: Indices) -
     return samples
 
 
+def encoder_of(weights: Mapping[str, NDArray[Any]]) -> Encoder:
+    """The trained network of those weights. Raises BadInputError when they are not an Encoder's."""
+    encoder = Encoder(variational="log_variance.weight" in weights)
+    try:
+        encoder.load_state_dict({name: torch.from_numpy(np.array(value)) for name, value in weights.items()})
+    except (RuntimeError, TypeError) as error:
+        raise BadInputError(f"these are not the weights of an encoder: {error}") from error
+    return encoder.eval()
+
+
 def encode(
     weights: Mapping[str, NDArray[Any]], images: Bytes, indices: Indices, *, device: str = "cpu", batch: int = 256
 ) -> NDArray[np.float32]:
@@ -945,12 +955,7 @@ def encode(
     Raises BadInputError when the weights are not an Encoder's, or the device is not there.
     """
     target = check_device(device)
-    encoder = Encoder(variational="log_variance.weight" in weights)
-    try:
-        encoder.load_state_dict({name: torch.from_numpy(np.array(value)) for name, value in weights.items()})
-    except (RuntimeError, TypeError) as error:
-        raise BadInputError(f"these are not the weights of an encoder: {error}") from error
-    encoder = encoder.eval().to(target)
+    encoder = encoder_of(weights).to(target)
     z = np.empty((len(indices), LATENT), np.float32)
     with torch.inference_mode():
         for start in range(0, len(indices), batch):

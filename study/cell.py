@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 
 from study.autoencoder import TrainedEncoder, check_device, encode, train_encoder
 from study.config import CEILING, BadInputError, cell_key, encoder_key
+from study.exported import export_driver
 from study.frames import Frames, FrameStore, open_frames
 from study.policy import train_policies
 from study.provenance import provenance
-from study.result import NO_SEED, CellJob, CellResult
+from study.result import NETWORK, NO_SEED, CellJob, CellResult
 from study.state import true_state
 
 PROBED = ("speed", "light", "lead_gap")  # columns of the labels that reports probe the latents for
@@ -116,7 +117,7 @@ def run_cell(job: CellJob, log: Log, progress: Progress) -> CellResult:
             "provenance": origin,
         },
     )
-    result.save(job.result_folder)
+    result.save(job.result_folder, lambda folder: export_driver(result, folder / NETWORK) if result.encoder else None)
     return result
 
 

@@ -35,7 +35,7 @@ from study.frames import open_frames
 from study.grid import TRIES, Queue, QueueLostError, Ticket
 from study.plan import Plan, thread_hint
 from study.provenance import cores, provenance
-from study.result import CellJob, CellResult
+from study.result import NETWORK, CellJob, CellResult
 from study.scratch import temporary_files, using
 from study.store import TrackerLostError
 from study.tracking import CellRun, Tracker
@@ -246,7 +246,8 @@ class Crew:
         if held is None:
             self._let_go(job, run)
             return
-        self._patiently(self._tracker.commit, run, result)
+        network = job.result_folder / NETWORK
+        self._patiently(self._tracker.commit, run, result, network if network.is_file() else None)  # a ceiling has none
         self._patiently(self._queue.done, held, _score(result))
         shutil.rmtree(job.result_folder)
         self._finish(job.key)

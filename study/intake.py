@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from study.config import BadInputError
 from study.plan import Plan
 from study.provenance import provenance
-from study.result import CellResult, load_results
+from study.result import NETWORK, CellResult, load_results
 
 if TYPE_CHECKING:  # what is wrong with the results is told without MLflow
     from study.tracking import Tracker
@@ -39,6 +40,8 @@ def take_in(plan: Plan, folder: Path, keys: Sequence[str], tracker: Tracker) -> 
 
     Raises BadInputError when the frames' manifest beside the results is not theirs.
     """
+    from study.exported import export_driver  # noqa: PLC0415 - torch, which a refusal does not need
+
     data = _manifest(plan, folder)
     done = tracker.finished(list(plan.cells))
     sweep_run = tracker.open_sweep(plan.grid, plan.profile, plan.settings, plan.cells, data, provenance())
@@ -50,7 +53,10 @@ def take_in(plan: Plan, folder: Path, keys: Sequence[str], tracker: Tracker) -> 
                 continue
             run = tracker.start_cell(sweep_run, plan.cells[key], key, plan.settings, plan.grid.policy_seeds)
             try:
-                done[key] = tracker.commit(run, CellResult.load(folder / key))
+                result = CellResult.load(folder / key)
+                with tempfile.TemporaryDirectory() as name:  # made here, of the weights: no network comes from outside
+                    network = export_driver(result, Path(name) / NETWORK) if result.encoder else None
+                    done[key] = tracker.commit(run, result, network)
             except BaseException:
                 tracker.interrupt(run)
                 raise

@@ -261,15 +261,17 @@ def forward_backward(
 
 def outputs(weights: Sequence[tuple[Tensor, Tensor]], x: Tensor) -> Tensor:
     """Outputs [G, N, O] of G policies without dropout for x [N, 64]."""
-    parts = []
-    for start in range(0, len(x), _ROWS):
-        hidden = x[start : start + _ROWS].expand(len(weights[0][0]), -1, -1)
-        for depth, (weight, bias) in enumerate(weights):
-            hidden = torch.baddbmm(bias, hidden, weight)
-            if depth < len(weights) - 1:
-                hidden.relu_()
-        parts.append(hidden)
-    return torch.cat(parts, 1)
+    return torch.cat([through(weights, x[start : start + _ROWS]) for start in range(0, len(x), _ROWS)], 1)
+
+
+def through(weights: Sequence[tuple[Tensor, Tensor]], x: Tensor) -> Tensor:
+    """The same in one pass: weights [G, in, out] and biases [G, 1, out] layer by layer."""
+    hidden = x.expand(len(weights[0][0]), -1, -1)
+    for depth, (weight, bias) in enumerate(weights):
+        hidden = torch.baddbmm(bias, hidden, weight)
+        if depth < len(weights) - 1:
+            hidden.relu_()
+    return hidden
 
 
 def predict(weights: Mapping[str, NDArray[Any]], z: NDArray[np.float32]) -> tuple[NDArray[Any], NDArray[Any]]:

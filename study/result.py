@@ -7,7 +7,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ CURVE_COLUMNS = ("policy_seed", "stage", "split", "epoch", "metric", "value")
 TABLE_COLUMNS = ("sweep", "heads", "fraction", "encoder_seed", *CURVE_COLUMNS)
 NO_SEED = -1  # policy_seed of rows that belong to the encoder
 ARRAYS = ("encoder", "policies", "samples", "predictions")
+NETWORK = "network.pt2"  # beside a result that is to be committed: encoder and policies as one network
 FILES = ("curves.parquet", *(f"{part}.safetensors" for part in ARRAYS))  # beside cell.json, which names their digests
 
 Arrays = dict[str, NDArray[Any]]
@@ -89,8 +90,8 @@ class CellResult:
     predictions: Arrays
     facts: dict[str, Any]
 
-    def save(self, folder: Path) -> Path:
-        """Write the result as `folder`, whole or not at all."""
+    def save(self, folder: Path, add: Callable[[Path], object] | None = None) -> Path:
+        """Write the result as `folder`, whole or not at all, with what `add` writes into it."""
         folder.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as name:
             draft = Path(name) / folder.name
@@ -109,6 +110,8 @@ class CellResult:
                 "facts": self.facts,
             }
             (draft / "cell.json").write_text(json.dumps(head, indent=1), encoding="utf-8")
+            if add:
+                add(draft)
             if folder.exists():
                 shutil.rmtree(folder)
             os.rename(draft, folder)  # noqa: PTH104 - the one atomic step

@@ -30,6 +30,7 @@ for _name, _value in {
     "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "5",
     "MLFLOW_HTTP_REQUEST_BACKOFF_FACTOR": "1",
     "GIT_PYTHON_REFRESH": "quiet",
+    "MLFLOW_ALLOW_PICKLE_DESERIALIZATION": "false",  # a model that could carry code is refused
 }.items():
     os.environ.setdefault(_name, _value)
 
@@ -59,10 +60,10 @@ class Store:
     lock: Path | None
     artifacts: Path | None  # where a new experiment's go; a server knows itself
 
-    def experiment(self, name: str, tags: Callable[[str], Mapping[str, str]]) -> str:
-        """The number of the experiment of that name, made if it is not there; `tags` gives its tags by its number.
+    def experiment(self, name: str, tags: Callable[[str, Mapping[str, str]], Mapping[str, str]]) -> str:
+        """The number of the experiment of that name, made if it is not there.
 
-        Raises BadInputError when it is deleted.
+        `tags` gives its tags by its number and those it has. Raises BadInputError when it is deleted.
         """
         found = self.client.get_experiment_by_name(name)
         if found is None:
@@ -76,8 +77,8 @@ class Store:
                 f"{found.experiment_id if found else '...'}"
             )
         number = str(found.experiment_id)
-        for key, value in tags(number).items():
-            if key not in found.tags:
+        for key, value in tags(number, found.tags).items():
+            if found.tags.get(key) != value:
                 self.client.set_experiment_tag(number, key, value)
         if self.database and BESIDE in found.tags:  # without it, someone keeps them elsewhere on purpose
             self._follow(number, str(found.artifact_location))
@@ -95,6 +96,11 @@ class Store:
             )
             database.execute(
                 "UPDATE runs SET artifact_uri = ? || substr(artifact_uri, ?) WHERE substr(artifact_uri, 1, ?) = ?",
+                (new, len(old) + 1, len(old) + 1, f"{old}/"),
+            )
+            database.execute(
+                "UPDATE logged_models SET artifact_location = ? || substr(artifact_location, ?) "
+                "WHERE substr(artifact_location, 1, ?) = ?",
                 (new, len(old) + 1, len(old) + 1, f"{old}/"),
             )
         database.close()

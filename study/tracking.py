@@ -29,9 +29,11 @@ import pandas as pd
 
 from study.config import DEFAULT_TRACKING, BadInputError, Cell, Grid, StudySettings, content_key, masked
 from study.confounds import contrasts, varied
+from study.mlmodel import log_model
 from study.points import COMMIT, Point, bands, cell_points, facts_of, flatten, points, scores_of
 from study.result import ARRAYS, CellResult, SweepRecord
 from study.store import TROUBLES, TrackerLostError, alone, few_tries, guard, open_store
+from study.view import NOTE, about, welcome
 
 # isort: split
 from mlflow.entities import Dataset, DatasetInput, InputTag, Metric, Param, Run, RunTag
@@ -45,21 +47,8 @@ VALUE_LIMIT = 4000  # characters of a parameter or tag; MLflow takes 6000 and 80
 HOST, PROCESS, ALIVE = "host", "process", "alive"  # tags of an attempt: who writes it, and when last [ms since 1970]
 AGAIN = "again"  # tag of a failed attempt that is not the last
 SIGN = 5.0  # [s] between two signs of life
-PARENT, NOTE = "mlflow.parentRunId", "mlflow.note.content"
+PARENT = "mlflow.parentRunId"
 FLUSH = 2.0  # [s] between two writes of live curves
-# Columns [pixels] of the view of all cells that MLflow's pages open with `?viewStateShareKey=cells`.
-VIEW = {
-    "params.`heads`": 90,
-    "params.`fraction`": 80,
-    "params.`encoder_seed`": 110,
-    "params.`policy_seeds`": 110,
-    "metrics.`final/acceleration_accuracy`": 200,
-    "metrics.`final/acceleration_accuracy/sd`": 210,
-    "metrics.`final/steering_loss`": 160,
-    "metrics.`floor`": 80,
-    "tags.`sweep`": 110,
-}
-
 # SQLite bears one writer: live curves of one cell wait while another cell is committed.
 _ONE_WRITER = threading.RLock()
 
@@ -170,7 +159,7 @@ class Tracker:
         self._store = open_store(uri)
         self.uri, self.client = self._store.shown, self._store.client
         with guard(self.uri, opening=True), few_tries():
-            self.experiment = self._store.experiment(experiment, _welcome)
+            self.experiment = self._store.experiment(experiment, welcome)
 
     @classmethod
     def look(cls, uri: str = DEFAULT_TRACKING, experiment: str = "study") -> Self | None:
@@ -380,6 +369,8 @@ class Tracker:
                 "cell_key": key,
                 "attempt": str(1 + len(before)),
                 "sweep": sweep.info.run_name,
+                "state": "running",
+                NOTE: about(cell, policy_seeds),
                 PARENT: sweep_run_id,
             }
             started = time.time_ns() // 1_000_000
@@ -396,9 +387,10 @@ class Tracker:
                 self.client.log_inputs(run_id, datasets=sweep.inputs.dataset_inputs)
         return CellRun(run_id, key, cell, started, self.client)
 
-    def commit(self, cell_run: CellRun, result: CellResult) -> str:
+    def commit(self, cell_run: CellRun, result: CellResult, network: Path | None = None) -> str:
         """Log a result whole, and only then mark its run FINISHED. Returns the run id that holds the key's result.
 
+        `network`, the result's as study.exported writes it, becomes the run's MLflow model `driver`.
         When another attempt has finished this key meanwhile, that one counts and this run ends as KILLED. After a
         TrackerLostError it can be called again: nothing is doubled.
         """
@@ -419,11 +411,19 @@ class Tracker:
             self._log_seeds(cell_run, result.curves, scores)
             cell_run.finish(cell_points(result.curves))
             numbers, words = facts_of(result.facts)
+            words["state"] = "finished"
             for ending, values in bands(scores).items():
-                numbers |= {f"final/{name}{ending}": v for name, v in zip(scores.columns, values, strict=True)}
+                numbers |= {
+                    f"final/{name}{ending}": float(f"{v:.5g}") for name, v in zip(scores.columns, values, strict=True)
+                }
+            model = log_model(self.client, self.experiment, cell_run.run_id, result, network) if network else None
             self.client.log_batch(
                 cell_run.run_id,
-                metrics=[Metric(n, float(v), cell_run.started, 0) for n, v in numbers.items() if math.isfinite(v)],
+                metrics=[
+                    Metric(name, float(value), cell_run.started, 0, model_id=model)
+                    for name, value in numbers.items()
+                    if math.isfinite(value)
+                ],
                 tags=[RunTag(name, _short(value)) for name, value in words.items()],
             )
             self.client.set_terminated(cell_run.run_id, "FINISHED")
@@ -522,7 +522,10 @@ class Tracker:
         for seed in self._search(f"tags.kind = 'seed' and tags.`{PARENT}` = '{run_id}'"):
             if seed.info.status == "RUNNING":
                 self.client.set_terminated(seed.info.run_id, status)
-        self.client.log_batch(run_id, tags=[RunTag(name, _short(value)) for name, value in tags.items()])
+        for model in self.client.search_logged_models([self.experiment], f"source_run_id = '{run_id}'"):
+            self.client.delete_logged_model(model.model_id)  # its upload was cut off, and would seem to go on for ever
+        words = {**tags, "state": status.lower()}
+        self.client.log_batch(run_id, tags=[RunTag(name, _short(value)) for name, value in words.items()])
         self.client.set_terminated(run_id, status)
 
     def _text(self, run_id: str, name: str) -> str:
@@ -554,26 +557,6 @@ def _dataset(data: Mapping[str, Any]) -> DatasetInput:
     profile = json.dumps({name: value for name, value in flatten(data).items() if isinstance(value, int | float)})
     entity = Dataset("frames", digest[:36], "code", source, profile=profile[:100_000])
     return DatasetInput(entity, [InputTag("mlflow.data.context", "train and test")])
-
-
-def _welcome(experiment: str) -> dict[str, str]:
-    """Tags that make an experiment's page readable: a word on what is there, and a view of all cells."""
-    view = {
-        "searchFilter": "tags.kind = 'cell' and attributes.status != 'KILLED'",
-        "orderByKey": "params.`heads`",  # any order but by date: MLflow then lists cells, not sweeps to unfold
-        "orderByAsc": True,
-        "startTime": "ALL",
-        "lifecycleFilter": "Active",
-        "datasetsFilter": [],
-        "selectedColumns": list(VIEW),
-        "columnOrder": list(VIEW),
-        "columnWidths": VIEW,
-    }
-    link = f"#/experiments/{experiment}/runs?viewStateShareKey=cells&workflowType=machine_learning"
-    return {
-        NOTE: f"Each sweep unfolds to its cells, each cell to its policy seeds. [All cells with their scores]({link})",
-        "mlflow.sharedViewState.cells": json.dumps(view),
-    }
 
 
 def _finished_order(run: Run) -> tuple[int, str]:

@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field
 
 import numpy as np
 import pandas as pd
 
 from study.claims import Evidence
-from study.config import HEAD_SETS, Grid, StudySettings
+from study.config import (
+    ACCELERATION_HIDDEN,
+    CHANNELS,
+    CORE,
+    HEAD_SETS,
+    KERNEL,
+    LATENT,
+    STEERING_HIDDEN,
+    Grid,
+    StudySettings,
+)
 from study.result import CURVE_COLUMNS, NO_SEED, CellResult, SweepRecord
 
 FRAMES, EPISODES, SAMPLES = 600, 15, 16
@@ -182,8 +193,8 @@ def simulate_cell(cell, key, settings, world, seeds, rng, labels):
         key=key,
         settings=settings.model_dump(mode="json") | {"policy_seeds": seeds, "frames_key": "f" * 16},
         curves=pd.concat(parts, ignore_index=True),
-        encoder={"weight": np.zeros(4, np.float32)} if heads else {},
-        policies={"z_mean": np.zeros(64, np.float32)},
+        encoder=_encoder() if heads else {},
+        policies=_policies(seeds),
         samples=samples,
         predictions={
             "acceleration": guess.astype(np.uint8),
@@ -211,6 +222,32 @@ def simulate_cell(cell, key, settings, world, seeds, rng, labels):
             "threads": 2,
         },
     )
+
+
+def _encoder():
+    """Weights of an encoder that gives zero for all it sees."""
+    weights = {"mean.weight": (LATENT, CHANNELS[-1] * CORE * CORE), "mean.bias": (LATENT,)}
+    for number, (before, after) in enumerate(itertools.pairwise((3, *CHANNELS))):
+        layer = f"convolutions.{3 * number}"
+        weights |= {f"{layer}.weight": (after, before, KERNEL, KERNEL), f"{layer}.bias": (after,)}
+        layer = f"convolutions.{3 * number + 1}"
+        weights |= {f"{layer}.{name}": (after,) for name in ("weight", "bias", "running_mean", "running_var")}
+        weights[f"{layer}.num_batches_tracked"] = ()
+    return {name: np.zeros(shape, np.int64 if shape == () else np.float32) for name, shape in weights.items()}
+
+
+def _policies(seeds):
+    """Weights of policies that say zero, whatever z is."""
+    weights = {
+        "z_mean": np.zeros(LATENT, np.float32),
+        "z_std": np.ones(LATENT, np.float32),
+        "z_l2": np.zeros(1, np.uint8),
+    }
+    for network, widths in (("steering", (*STEERING_HIDDEN, 1)), ("acceleration", (*ACCELERATION_HIDDEN, 3))):
+        for layer, (before, after) in enumerate(itertools.pairwise((LATENT, *widths))):
+            weights[f"{network}_{layer}_weight"] = np.zeros((seeds, before, after), np.float32)
+            weights[f"{network}_{layer}_bias"] = np.zeros((seeds, after), np.float32)
+    return weights
 
 
 def _pictures(rng):

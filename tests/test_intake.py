@@ -82,11 +82,11 @@ def cell_runs(here):
 def test_an_import_that_was_stopped_goes_on_and_commits_every_cell_once(here, plan, folder, monkeypatch, capsys):
     commit, left = Tracker.commit, [1]
 
-    def stopped(self, run, result):
+    def stopped(self, *what):
         if not left:
             raise KeyboardInterrupt
         left.pop()
-        return commit(self, run, result)
+        return commit(self, *what)
 
     monkeypatch.setattr(Tracker, "commit", stopped)
     assert main([*PLAN, "--import-results", str(folder)]) == EXIT_INTERRUPTED

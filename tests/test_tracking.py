@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from mlflow.artifacts import download_artifacts
 
 from servers import free_port
 from study.config import BadInputError, Cell, Grid, StudySettings, masked
@@ -45,7 +46,7 @@ def make_result(cell, key, seed=0):
         settings={"policy_seeds": SEEDS},
         curves=pd.DataFrame(rows, columns=["policy_seed", "stage", "split", "epoch", "metric", "value"]),
         encoder={"w": rng.random((4, 3), dtype=np.float32)},
-        policies={"w": rng.random((SEEDS, 5), dtype=np.float32)},
+        policies={"steering_2_bias": rng.random((SEEDS, 1), dtype=np.float32)},
         samples={"input": rng.integers(0, 255, (2, 64, 64, 3), dtype=np.uint8)},
         predictions={"acceleration": rng.integers(0, 3, (SEEDS, 7), dtype=np.uint8)},
         facts={
@@ -241,6 +242,62 @@ def test_a_result_of_another_cell_is_refused(tracker):
     run = start(tracker, open_sweep(tracker, planned), planned, "other-0")
     with pytest.raises(ValueError, match="other-1"):
         tracker.commit(run, make_result(planned["other-1"], "other-1"))
+
+
+# --- models ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def network(tmp_path):
+    """Stands for an exported network; the tracker does not look inside."""
+    file = tmp_path / "network.pt2"
+    file.write_bytes(b"a graph and its weights")
+    return file
+
+
+def models(tracker):
+    return list(tracker.client.search_logged_models([tracker.experiment]))
+
+
+def network_at(tracker, address):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MLFLOW_TRACKING_URI", tracker.client.tracking_uri)
+        return Path(download_artifacts(address)) / "data" / "model.pt2"
+
+
+def test_a_committed_cell_has_its_model_with_its_scores(tracker, network):
+    planned = cells("model")
+    sweep = open_sweep(tracker, planned)
+    run_id = tracker.commit(
+        start(tracker, sweep, planned, "model-1"), make_result(planned["model-1"], "model-1"), network
+    )
+    (model,) = models(tracker)
+    assert (model.source_run_id, str(model.status)) == (run_id, "READY")
+    assert model.params == {"heads": "full", "fraction": "1.0", "encoder_seed": "0", "policy_seeds": str(SEEDS)}
+    assert "final/acceleration_accuracy" in {metric.key for metric in model.metrics}
+    run = tracker.client.get_run(run_id)
+    assert [output.model_id for output in run.outputs.model_outputs] == [model.model_id]
+    for address in (f"runs:/{run_id}/driver", f"models:/{model.model_id}"):
+        assert network_at(tracker, address).read_bytes() == network.read_bytes()
+
+
+def test_a_commit_that_broke_off_is_repeated_with_one_model(tracker, network):
+    planned = cells("once")
+    run = start(tracker, open_sweep(tracker, planned), planned, "once-0")
+    for _ in range(2):
+        tracker.commit(run, make_result(planned["once-0"], "once-0"), network)
+        tracker.client.update_run(run.run_id, status="RUNNING")  # as if it had been cut before the last step
+    assert len(models(tracker)) == 1
+    assert len(tracker.client.get_run(run.run_id).outputs.model_outputs) == 1
+
+
+def test_an_attempt_that_was_killed_leaves_no_model(tracker):
+    planned = cells("pending")
+    sweep = open_sweep(tracker, planned)
+    killed = start(tracker, sweep, planned, "pending-0")
+    tracker.client.create_logged_model(tracker.experiment, "driver", killed.run_id)  # where the upload was cut off
+    start(tracker, sweep, planned, "pending-0")
+    assert models(tracker) == []
 
 
 # --- attempts -------------------------------------------------------------------------------------------------------
@@ -454,17 +511,19 @@ def test_a_finished_cell_without_its_whole_result_is_one_clear_error(tracker, da
         tracker.read_sweep("heads")
 
 
-def test_a_moved_store_keeps_its_artifacts(tmp_path):
+def test_a_moved_store_keeps_its_artifacts(tmp_path, network):
     old, new = tmp_path / "old", tmp_path / "new place #1"
     planned = cells("moved")
     first = Tracker(f"{SQLITE}{old}/mlflow.db")
     sweep = open_sweep(first, planned)
-    run_id = train(first, sweep, planned, "moved-0")
+    run_id = first.commit(start(first, sweep, planned, "moved-0"), make_result(planned["moved-0"], "moved-0"), network)
     first.client._tracking_client.store._dispose_engine()
     old.rename(new)
     tracker = Tracker(f"{SQLITE}{new}/mlflow.db")
     assert_same_result(tracker.load_result(run_id), make_result(planned["moved-0"], "moved-0"))
-    train(tracker, sweep, planned, "moved-1")
+    assert network_at(tracker, f"runs:/{run_id}/driver").is_file()
+    for key in list(planned)[1:]:
+        train(tracker, sweep, planned, key)
     assert tracker.read_sweep("heads").complete
     assert not old.exists()
 
@@ -472,9 +531,9 @@ def test_a_moved_store_keeps_its_artifacts(tmp_path):
 def test_artifacts_that_are_kept_elsewhere_on_purpose_stay_there(uri, tmp_path):
     Tracker(uri).client.create_experiment("elsewhere", str(tmp_path / "artifacts"))
     planned = cells("elsewhere")
-    for number in range(2):  # opened anew
-        tracker = Tracker(uri, experiment="elsewhere")
-        train(tracker, open_sweep(tracker, planned), planned, f"elsewhere-{number}")
+    for key in planned:
+        tracker = Tracker(uri, experiment="elsewhere")  # opened anew
+        train(tracker, open_sweep(tracker, planned), planned, key)
     assert tracker.read_sweep("heads").complete
     assert (tmp_path / "artifacts").is_dir()
 
