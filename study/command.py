@@ -47,7 +47,7 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print the message without the long usage, and exit with code 2."""
-        self.exit(EXIT_BAD_INPUT, f"error: {message}\nSee python -m {self.prog} --help\n")
+        self.exit(EXIT_BAD_INPUT, f"error: {masked(message)}\nSee python -m {self.prog} --help\n")
 
 
 def _value(text: str) -> Any:
@@ -108,7 +108,7 @@ def run(main: Callable[[Sequence[str]], int]) -> NoReturn:
     try:
         code = main(sys.argv[1:])
     except BadInputError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {masked(str(error))}", file=sys.stderr)
         code = EXIT_BAD_INPUT
     except BrokenPipeError:  # the reader, such as `head`, has seen enough
         sys.stderr.close()

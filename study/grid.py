@@ -269,7 +269,8 @@ class Queue:
         except (StorageInternalError, SQLAlchemyError) as error:
             # When a server was away nobody could record a heartbeat: all get the time to do so again.
             self._judges_from = time.monotonic() + self._grace
-            raise QueueLostError(f"the queue {self._uri} gave no usable answer: {_told(error)}") from None
+            step = "start its server again" if self.shared else "look at disk space and rights"
+            raise QueueLostError(f"the queue {self._uri} gave no usable answer: {_told(error)}; {step}") from None
 
     def close(self) -> None:
         """End the heartbeats: what is still held waits again after the grace period."""

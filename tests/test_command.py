@@ -27,6 +27,7 @@ def sweep(*words, cwd=None):
         (["heads", "--fractions", "0"], "greater than 0"),
         (["heads", "--workers", "0"], "1 or more"),
         (["heads", "--json"], "--dry-run"),
+        (["heads", "--qeue=postgresql://me:secret@host/db"], "--qeue=postgresql://***@host/db"),
         ([], "NAME"),
     ],
 )
@@ -34,6 +35,7 @@ def test_bad_input_is_one_clear_error_and_exit_code_2(words, expected):
     done = sweep(*words)
     assert done.returncode == 2
     assert expected in done.stderr
+    assert "secret" not in done.stderr
     assert "Traceback" not in done.stderr
 
 

@@ -95,13 +95,17 @@ def test_datasize_reuses_the_cells_of_heads(folder):
     assert status(folder, "datasize", *SMALL, "--fractions", "[1.0,0.5]") == {"finished": 3, "waiting": 2}
 
 
-def test_a_failed_cell_leaves_the_others_and_is_told(folder, tmp_path):
+def test_a_failed_cell_leaves_the_others_is_told_and_runs_again_when_asked_for(folder, tmp_path):
     take(folder, tmp_path)
-    done = sweep(tmp_path, "heads", *SMALL, "--heads", "[rec,rec+pred]", "--encoder.lr", "1e30", *LESS, "--no-report")
-    assert done.returncode == 1
-    assert "failed: rec 100% e0" in done.stderr
-    assert "failed: rec+pred 100% e0" in done.stderr
-    assert "epoch" in done.stderr
+    words = ("heads", *SMALL, "--heads", "[rec,rec+pred]", "--encoder.lr", "1e30", *LESS, "--no-report")
+    for more, tries in ((), 2), ((), 2), (("--retry-failed",), 4):
+        done = sweep(tmp_path, *words, *more)
+        assert done.returncode == 1
+        assert "failed: rec 100% e0" in done.stderr
+        assert "failed: rec+pred 100% e0" in done.stderr
+        assert "epoch" in done.stderr
+        assert "--no-report --retry-failed\n" in done.stderr
+        assert runs(tmp_path) == {"FAILED": tries}
 
 
 def test_four_workers_give_the_table_of_one(folder, tmp_path):
@@ -138,8 +142,9 @@ def test_a_stopped_sweep_goes_on_and_ends_like_one_that_was_not(folder, tmp_path
             break
     time.sleep(5)
     process.send_signal(how)
-    process.stderr.read()
+    said = process.stderr.read()
     assert process.wait(10) != 0
+    assert how == signal.SIGKILL or "To go on: python -m study.sweep heads" in said
 
     done = sweep(tmp_path, "heads", *SMALL, *TWO, *LESS)
     assert done.returncode == 0, done.stderr
