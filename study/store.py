@@ -23,7 +23,7 @@ from study.config import DEFAULT_TRACKING, BadInputError, masked
 # being four minutes; whoever sets these differently is obeyed.
 os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
 for _name, _value in {
-    "MLFLOW_LOGGING_LEVEL": "ERROR",
+    "MLFLOW_LOGGING_LEVEL": "CRITICAL",  # its errors come with tracebacks; we tell them in one line
     "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",
     "MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR": "false",
     "MLFLOW_HTTP_REQUEST_TIMEOUT": "30",
@@ -41,7 +41,8 @@ from sqlalchemy.exc import SQLAlchemyError  # noqa: E402 - comes with mlflow, wh
 
 SQLITE = "sqlite:///"
 SCHEMES = ("sqlite:///", "http://", "https://", "postgresql://", "postgresql+psycopg2://", "postgresql+psycopg://")
-PROBE = 3.0  # [s] a server has to answer when it is opened
+PROBE = 3.0  # [s] a server has to answer when it is opened ...
+BUSY = 30.0  # ... and one that has answered, to do so again while it serves others
 BESIDE = "artifacts_beside_database"  # tag of an experiment whose artifacts move with its database
 TROUBLES = (MlflowException, SQLAlchemyError, OSError)  # what a store raises when it is lost
 
@@ -122,7 +123,7 @@ def open_store(uri: str) -> Store:
         _probe(uri, shown)
     else:
         artifacts = Path(DEFAULT_TRACKING.removeprefix(SQLITE)).absolute().parent / "artifacts"
-    with guard(shown, opening=True), few_tries():
+    with guard(shown, opening=True), few_tries(BUSY):
         return Store(MlflowClient(uri), shown, database, lock, artifacts)
 
 
@@ -146,9 +147,9 @@ def guard(shown: str, *, opening: bool = False) -> Iterator[None]:
 
 
 @contextmanager
-def few_tries() -> Iterator[None]:
-    """Ask a server once or twice only, and a few seconds at most."""
-    names = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1", "MLFLOW_HTTP_REQUEST_TIMEOUT": str(int(PROBE))}
+def few_tries(seconds: float = PROBE) -> Iterator[None]:
+    """Ask a server once or twice only, with `seconds` to answer."""
+    names = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1", "MLFLOW_HTTP_REQUEST_TIMEOUT": str(int(seconds))}
     before = {name: os.environ.get(name) for name in names}
     os.environ.update(names)
     try:

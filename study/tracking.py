@@ -32,7 +32,7 @@ from study.confounds import contrasts, varied
 from study.mlmodel import log_model
 from study.points import COMMIT, Point, bands, cell_points, facts_of, flatten, points, scores_of
 from study.result import ARRAYS, CellResult, SweepRecord
-from study.store import TROUBLES, TrackerLostError, alone, few_tries, guard, open_store
+from study.store import BUSY, TROUBLES, TrackerLostError, alone, few_tries, guard, open_store
 from study.view import NOTE, about, welcome
 
 # isort: split
@@ -158,7 +158,7 @@ class Tracker:
         """Open the store and create what is missing. Raises BadInputError when it is not there or not MLflow's."""
         self._store = open_store(uri)
         self.uri, self.client = self._store.shown, self._store.client
-        with guard(self.uri, opening=True), few_tries():
+        with guard(self.uri, opening=True), few_tries(BUSY):
             self.experiment = self._store.experiment(experiment, welcome)
 
     @classmethod
