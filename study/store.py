@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from study.config import DEFAULT_TRACKING, BadInputError, masked
 
@@ -80,7 +81,7 @@ class Store:
         number = str(found.experiment_id)
         for key, value in tags(number, found.tags).items():
             if found.tags.get(key) != value:
-                self.client.set_experiment_tag(number, key, value)
+                insert(self.client.set_experiment_tag, number, key, value)
         if self.database and BESIDE in found.tags:  # without it, someone keeps them elsewhere on purpose
             self._follow(number, str(found.artifact_location))
         return number
@@ -144,6 +145,16 @@ def guard(shown: str, *, opening: bool = False) -> Iterator[None]:
             step = f"copy the file, then run: mlflow db upgrade {shown}"
         # `from None`: what lies below may name credentials.
         raise TrackerLostError(f"the tracking store {shown} gave no usable answer: {text}; {step}") from None
+
+
+def insert(write: Callable[..., Any], *what: Any, **more: Any) -> None:
+    """Write; when another process has written the same in this moment, MLflow's insert fails once, then finds it."""
+    try:
+        write(*what, **more)
+    except MlflowException as error:
+        if error.error_code != "BAD_REQUEST":
+            raise
+        write(*what, **more)
 
 
 @contextmanager

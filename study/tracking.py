@@ -19,7 +19,7 @@ import platform
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,12 +32,11 @@ from study.confounds import contrasts, varied
 from study.mlmodel import log_model
 from study.points import COMMIT, Point, bands, cell_points, facts_of, flatten, points, scores_of
 from study.result import ARRAYS, CellResult, SweepRecord
-from study.store import BUSY, TROUBLES, TrackerLostError, alone, few_tries, guard, open_store
+from study.store import BUSY, TROUBLES, TrackerLostError, alone, few_tries, guard, insert, open_store
 from study.view import NOTE, about, welcome
 
 # isort: split
 from mlflow.entities import Dataset, DatasetInput, InputTag, Metric, Param, Run, RunTag
-from mlflow.exceptions import MlflowException
 from mlflow.tracking import MlflowClient
 
 RESULT = "result"  # artifact folder of a cell run
@@ -228,7 +227,7 @@ class Tracker:
                 if self._store.database and run.info.status == "RUNNING" and run.info.run_id != run_id:
                     self._close_cells(run.info.run_id)
                     self._close(run.info.run_id, "KILLED", {"reason": "another sweep was started"})
-            _insert(self.client.log_batch, run_id, params=params)
+            insert(self.client.log_batch, run_id, params=params)
             self.client.log_batch(run_id, tags=[RunTag(name, _short(value)) for name, value in tags.items() if value])
             self.client.log_dict(run_id, plan, "plan.json")
             if data or not mine:  # frames that were deleted since are still what the results were made from
@@ -236,7 +235,7 @@ class Tracker:
             self.client.log_dict(run_id, facts, "provenance.json")
             self.client.log_text(run_id, str(provenance.get("diff") or ""), "uncommitted.diff")
             if data:
-                _insert(self.client.log_inputs, run_id, datasets=[_dataset(data)])
+                insert(self.client.log_inputs, run_id, datasets=[_dataset(data)])
         return run_id
 
     def _reused(self, planned: Mapping[str, Cell], name: str) -> str:
@@ -565,13 +564,3 @@ def _finished_order(run: Run) -> tuple[int, str]:
 
 def _opened(run: Run) -> int:
     return int(run.data.tags.get("opened", 0))
-
-
-def _insert(write: Callable[..., Any], *what: Any, **more: Any) -> None:
-    """Write; when another process has written the same in this moment, MLflow's insert fails once, then finds it."""
-    try:
-        write(*what, **more)
-    except MlflowException as error:
-        if error.error_code != "BAD_REQUEST":
-            raise
-        write(*what, **more)
