@@ -1,0 +1,197 @@
+"""Sweeps as users run them: whole commands, in working folders of their own, on a study that takes seconds."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable
+from contextlib import closing, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import pandas as pd
+import psycopg
+
+ROOT = Path(__file__).parent.parent
+PATIENCE = 900.0  # [s] for anything to happen: a busy machine is slow, and no test here measures speed
+LOCKS = (".lock", ".in-use", ".mlflow.db.lock")  # stay, so that two processes never hold different files
+
+# Every stage for real, in a few seconds. The files of a profile are read from the working folder.
+TINY = """\
+town: {rows: 3, columns: 3, dropped_edges: 0, vehicles: 12}
+recording: {warm_up: 1, duration: 6, encoder_episodes: 2, policy_episodes: 2}
+frames: {encoder: 40, policy: 40}
+encoder: {epochs: 3, batch: 16}
+policy: {epochs: 5, batch: 16}
+"""
+
+
+def working_folder(folder: Path, data: Path | None = None) -> Path:
+    """A folder to run sweeps in; with the drives and frames of the working folder `data`, but nothing trained."""
+    shutil.copytree(ROOT / "sweeps", folder / "sweeps")
+    (folder / "sweeps/profiles/tiny.yaml").write_text(TINY)
+    for name in ("data/episodes", "data/frames") if data else ():
+        shutil.copytree(data / name, folder / name)
+    return folder
+
+
+def command(*words: str) -> list[str]:
+    return [sys.executable, "-m", "study.sweep", *words]
+
+
+def environment(**more: str) -> dict[str, str]:
+    return os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"} | more
+
+
+def sweep(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    """Run a sweep to its end."""
+    return subprocess.run(command(*words), cwd=folder, capture_output=True, text=True, check=False, env=environment())
+
+
+class Running:
+    """A command that runs in a session of its own, as one that a terminal has started; stderr goes to a file."""
+
+    def __init__(self, folder: Path, *words: str, log: Path | None = None, **more: str) -> None:
+        self.folder, self.log = folder, log or folder / "log"
+        with self.log.open("ab") as stream:
+            self._from = stream.tell()
+            self.process = subprocess.Popen(
+                words, cwd=folder, stdout=stream, stderr=stream, start_new_session=True, env=environment(**more)
+            )
+
+    @property
+    def said(self) -> str:
+        """What it has written so far."""
+        with self.log.open("rb") as log:
+            log.seek(self._from)
+            return log.read().decode(errors="replace")
+
+    @property
+    def running(self) -> bool:
+        return self.process.poll() is None
+
+    def until(self, sign: Callable[[], object]) -> bool:
+        """Wait for a sign. False: the command ended before."""
+        deadline = time.monotonic() + PATIENCE
+        while self.running:
+            if sign():
+                return True
+            assert time.monotonic() < deadline, f"no sign for {PATIENCE:.0f} s:\n{self.said}"
+            time.sleep(0.005)
+        return False
+
+    def end(self) -> int:
+        """Wait for its end, and for that of all it has started; its exit code."""
+        code = self.process.wait(PATIENCE)
+        deadline = time.monotonic() + PATIENCE
+        while self.family():
+            assert time.monotonic() < deadline, f"left behind: {self.family()}"
+            time.sleep(0.01)
+        return code
+
+    def family(self) -> dict[int, str]:
+        """Process id -> role of each process of the session: parent, data, server (of forks), cell, or other."""
+        known = {}
+        for path in Path("/proc").glob("[0-9]*"):
+            with suppress(OSError):  # ended meanwhile
+                fields = (path / "stat").read_text().rpartition(")")[2].split()
+                if fields[3] == str(self.process.pid) and fields[0] not in "ZX":
+                    known[int(path.name)] = ((path / "cmdline").read_text(errors="replace"), int(fields[1]))
+        roles = {}
+        for pid, (words, parent) in known.items():
+            if pid == self.process.pid:
+                roles[pid] = "parent"
+            elif "forkserver" in words:
+                roles[pid] = "cell" if "forkserver" in known.get(parent, ("", 0))[0] else "server"
+            else:
+                roles[pid] = "data" if "spawn_main" in words else "other"
+        return roles
+
+    def of(self, role: str) -> list[int]:
+        return [pid for pid, own in self.family().items() if own == role]
+
+    def send(self, signal_: signal.Signals, *pids: int) -> int:
+        """Send a signal; how many were still there to get it."""
+        sent = 0
+        for pid in pids:
+            try:
+                os.kill(pid, signal_)
+            except ProcessLookupError:
+                continue
+            sent += 1
+        return sent
+
+
+@dataclass(frozen=True)
+class Store:
+    """What MLflow has stored, read past it: `database` is a file or a PostgreSQL URI, `files` a server's artifacts."""
+
+    database: Path | str
+    files: Path | None = None
+
+    def ask(self, query: str) -> list[tuple[str, ...]]:
+        if isinstance(self.database, str):
+            with psycopg.connect(self.database) as connection:
+                return connection.execute(query).fetchall()
+        if not self.database.is_file():
+            return []
+        with closing(sqlite3.connect(f"file:{self.database}?mode=ro", uri=True, timeout=60)) as database:
+            return database.execute(query).fetchall()
+
+    def cells(self) -> Counter[str]:
+        """How many runs of cells there are, by status."""
+        query = "select status from runs join tags on runs.run_uuid = tags.run_uuid where key = 'cell_key'"
+        return Counter(status for (status,) in self.ask(query))
+
+    def folders(self) -> dict[str, Path]:
+        """Where the result of each finished cell lies, by key. Fails when a key has two finished runs."""
+        query = "select value, artifact_uri from runs join tags on runs.run_uuid = tags.run_uuid"
+        finished = self.ask(f"{query} where key = 'cell_key' and status = 'FINISHED'")
+        assert len({key for key, _ in finished}) == len(finished), "a cell was committed twice"
+        at = f"{self.files}/" if self.files else ""
+        return {key: Path(uri.replace("mlflow-artifacts:/", at)) / "result" for key, uri in finished}
+
+    def results(self) -> dict[str, list[str]]:
+        """Digests of the arrays of each finished cell, by key."""
+        return {
+            key: [hashlib.sha256(file.read_bytes()).hexdigest() for file in sorted(folder.glob("*.safetensors"))]
+            for key, folder in self.folders().items()
+        }
+
+
+def store(folder: Path) -> Store:
+    """The store of a working folder."""
+    return Store(folder / "mlruns/mlflow.db")
+
+
+def leftovers(folder: Path) -> list[str]:
+    """Drafts and hidden files that a finished sweep should not leave, and results that were not taken."""
+    found = [path for name in ("data", "mlruns", "reports") for path in (folder / name).rglob("*")]
+    drafts = [path for path in found if path.name[0] == "." and path.name not in LOCKS]
+    waiting = [path for path in found if path.name == "journal" or path.parent.name in ("cells", "tmp")]
+    return [str(path.relative_to(folder)) for path in drafts + waiting]
+
+
+def check_like(folder: Path, quiet: Path, kept: Store | None = None) -> None:
+    """A disturbed sweep has ended like the undisturbed one: every cell once, nothing doubled, nothing left behind.
+
+    It may have had some of the other's head sets only, and have `kept` its results elsewhere.
+    """
+    kept = kept or store(folder)
+    assert kept.ask("select run_uuid from runs where status = 'RUNNING'") == []
+    assert kept.ask("select run_uuid, key, step from metrics group by run_uuid, key, step having count(*) > 1") == []
+    ours, theirs = (pd.read_parquet(at / "reports/heads/curves.parquet") for at in (folder, quiet))
+    heads = set(ours["heads"])
+    found = kept.results()
+    assert len(found) == len(heads) >= 2
+    assert found.items() <= store(quiet).results().items()
+    pd.testing.assert_frame_equal(ours, theirs[theirs["heads"].isin(heads)].reset_index(drop=True), check_exact=True)
+    assert (folder / "reports/heads.pdf").read_bytes().startswith(b"%PDF")
+    assert leftovers(folder) == []
