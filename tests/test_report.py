@@ -53,7 +53,12 @@ def test_the_pdf_has_title_bookmarks_and_words_for_its_figures(built):
     assert reader.metadata.title == "Effect of different heads (heads, laptop)"
     assert reader.metadata.creation_date is None
     titles = [entry.title for entry in reader.outline if not isinstance(entry, list)]
-    assert [title.split(" ", 1)[-1] for title in titles][:3] == ["Summary", "Results", "Claims, one by one"]
+    assert [title.split(" ", 1)[-1] for title in titles][:4] == [
+        "Summary",
+        "Results",
+        "Confounds",
+        "Claims, one by one",
+    ]
     words = [element["/Alt"] for element in elements(reader.trailer["/Root"]["/StructTreeRoot"]) if "/Alt" in element]
     assert any("full ends at" in text for text in words)
 
