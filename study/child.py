@@ -23,7 +23,8 @@ NO_MEMORY = ("out of memory", "can't allocate memory")  # torch says so in Runti
 def start(job: CellJob) -> tuple[BaseProcess, Connection]:
     """A process that runs the cell, and the end of its pipe."""
     here, there = multiprocessing.Pipe(duplex=False)
-    process = _fork_server().Process(target=_serve, args=(job, there), name=job.cell.label, daemon=True)
+    # Not as a daemon, which may have no children: policies are trained in several processes.
+    process = _fork_server().Process(target=_serve, args=(job, there), name=job.cell.label, daemon=False)
     process.start()
     there.close()
     return process, here

@@ -3,8 +3,10 @@
 Two small networks with no weight in common learn from z: one gives the steering, one the logits of the three
 accelerations. The seeds never touch each other: the loss is their sum and Adam works number by number, so each seed
 becomes what it would have become alone. A unit of work is therefore one network on a group of seeds. On a CPU a group
-is one seed, its step fits into one core's cache, and each core takes the next group; results then depend neither on
-the number of cores nor on the seeds beside. On a GPU all seeds are one group.
+is one seed and its step fits into one core's cache. The seeds are shared out to processes, one for each thread that
+torch may use, and every process computes on one thread: results depend neither on the number of processes nor on the
+seeds beside. Threads in their place would hand the interpreter to each other at every call of torch, and gain nothing.
+On a GPU all seeds are one group, in this process.
 
 Suffixes: S seeds, G seeds of a group, B rows of a batch, N frames, H hidden units, O outputs, Z = 64 latent numbers.
 """
@@ -15,15 +17,18 @@ import functools
 import itertools
 import logging
 import math
-import queue
+import multiprocessing
 import threading
 import time
+import traceback
 import warnings
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from typing import Any, NamedTuple, Self
 
 import lightning
 import numpy as np
@@ -34,6 +39,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
+from study.command import deaf_to_interrupts, obey_parent
 from study.config import (
     ACCELERATION_HIDDEN,
     ACCELERATIONS,
@@ -43,11 +49,14 @@ from study.config import (
     BadInputError,
     PolicySettings,
 )
+from study.provenance import cores
 from study.result import CURVE_COLUMNS, TrainingDivergedError
 
 Log = Callable[[int, dict[str, float]], None]
 Progress = Callable[[int, int], None]
 Arrays = dict[str, NDArray[Any]]
+AfterEpoch = Callable[[int, Arrays], None]
+Labelled = tuple[NDArray[np.float32], pd.DataFrame]  # latents [N, 64] and their labels
 
 WIDTHS = {
     "steering": (LATENT, *STEERING_HIDDEN, 1),
@@ -63,6 +72,7 @@ _VECTOR = 16  # float32 in the widest register
 _DROPPED = -1e30  # takes a unit below zero, where the ReLU ends it
 _KEPT = 1 / (1 - DROPOUT)
 _ROWS = 2048  # evaluated at once: their hidden units fit into a core's cache
+_WORTH = 4_000_000  # frames that all seeds see, 15 s: a process takes 4 s of them to load torch
 
 assert DROPOUT == 0.5, "masks are made of random bits"
 
@@ -199,8 +209,8 @@ class Layer(NamedTuple):
     bias_gradient: Tensor
 
 
-class Scratch(threading.local):
-    """Memory of one thread that every pass uses again: fresh pages from the system cost as much as the products do."""
+class Scratch:
+    """Memory that every pass uses again: fresh pages from the system cost as much as the products do."""
 
     def __init__(self) -> None:
         self._kept: dict[tuple[str, torch.dtype], Tensor] = {}
@@ -326,39 +336,6 @@ def measure(steering: Tensor, logits: Tensor, labels: Labels) -> Tensor:
 # --- training -------------------------------------------------------------------------------------------------------
 
 
-class Crew:
-    """Cores that share out groups of seeds: one thread for each core, each of which computes alone.
-
-    Threads inside of each operation, torch's own way, would wait for each other forty times a step.
-    """
-
-    def __init__(self, threads: int) -> None:
-        self._pool = ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,))
-        self._threads = threads
-
-    def run(self, jobs: Sequence[Callable[[], None]]) -> None:
-        """Do all jobs; the longest should come first."""
-        waiting: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
-        for job in jobs:
-            waiting.put(job)
-
-        def work() -> None:
-            with torch.inference_mode():
-                while True:
-                    try:
-                        job = waiting.get_nowait()
-                    except queue.Empty:
-                        return
-                    job()
-
-        for done in [self._pool.submit(work) for _ in range(self._threads)]:
-            done.result()
-
-    def close(self) -> None:
-        """End the threads."""
-        self._pool.shutdown()
-
-
 @dataclass(frozen=True)
 class PolicyData:
     """What policies learn from and are measured on; x as `normalise` gives it.
@@ -383,18 +360,16 @@ class PolicyEnsemble(lightning.LightningModule):
         seeds: Sequence[int],
         settings: PolicySettings,
         data: PolicyData,
-        crew: Crew | None,
-        after_epoch: Callable[[int, Arrays], None],
+        after_epoch: AfterEpoch,
     ) -> None:
         super().__init__()
         self.automatic_optimization = False
         self.seeds, self.settings = tuple(seeds), settings
-        self._data, self._crew, self._after_epoch = data, crew, after_epoch
+        self._data, self._after_epoch = data, after_epoch
         self.stacks = nn.ParameterDict({name: nn.Parameter(stack(seeds, name)) for name in WIDTHS})
         self._scratch = Scratch()
         self._ahead: Draws | None = None
-        each = [slice(row, row + 1) for row in range(len(self.seeds))]
-        self._groups = each if crew else [slice(0, len(self.seeds))]
+        self._groups = _groups(len(self.seeds), data.x.device)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """Adam; fused, because the stack is small numbers in many places."""
@@ -437,7 +412,9 @@ class PolicyEnsemble(lightning.LightningModule):
         """One batch of every seed: the rows at `batch` in each seed's own order."""
         start = batch * self.settings.batch
         rows = slice(start, min(start + self.settings.batch, len(self._data.x)))
-        self._share_out(lambda name, index: self._pass(name, index, rows))
+        with torch.inference_mode():
+            for name, index in self._units():
+                self._pass(name, index, rows)
         self.optimizers(use_pl_optimizer=False).step()  # type: ignore[union-attr]
 
     def _pass(self, name: str, index: int, rows: slice) -> None:
@@ -464,7 +441,7 @@ class PolicyEnsemble(lightning.LightningModule):
         """Measure every policy without dropout."""
         views = self._data.views
         measured = torch.stack([measure(*self.outputs(x), labels) for x, labels in views.values()])
-        if self._crew is None and self.current_epoch + 1 < self.settings.epochs:
+        if len(self._groups) == 1 and self.current_epoch + 1 < self.settings.epochs:
             self._ahead = self._draw(self.current_epoch + 1)  # a GPU is still busy with this epoch
         self._after_epoch(self.current_epoch + 1, dict(zip(views, measured.cpu().numpy(), strict=True)))
 
@@ -472,22 +449,20 @@ class PolicyEnsemble(lightning.LightningModule):
         """Steering [S, N] and logits [S, N, 3] without dropout."""
         results = {name: x.new_empty((len(self.seeds), len(x), widths[-1])) for name, widths in WIDTHS.items()}
 
-        def fill(name: str, index: int) -> None:
-            layers = [(layer.weight, layer.bias) for layer in self._layers[name][index]]
-            results[name][self._groups[index]] = outputs(layers, x)
-
-        self._share_out(fill)
+        with torch.inference_mode():
+            for name, index in self._units():
+                layers = [(layer.weight, layer.bias) for layer in self._layers[name][index]]
+                results[name][self._groups[index]] = outputs(layers, x)
         return results["steering"][..., 0], results["acceleration"]
 
-    def _share_out(self, work: Callable[[str, int], None]) -> None:
-        """Do `work` for each network and group; steering, the larger network, comes first."""
-        jobs = [functools.partial(work, name, index) for name in WIDTHS for index in range(len(self._groups))]
-        if self._crew:
-            self._crew.run(jobs)
-        else:
-            with torch.no_grad():
-                for job in jobs:
-                    job()
+    def _units(self) -> Iterator[tuple[str, int]]:
+        """Each network with each group."""
+        return itertools.product(WIDTHS, range(len(self._groups)))
+
+
+def _groups(seeds: int, device: torch.device) -> list[slice]:
+    """Which seeds are computed at once."""
+    return [slice(0, seeds)] if device.type == "cuda" else [slice(seed, seed + 1) for seed in range(seeds)]
 
 
 def _steering_gradient(outputs: Tensor, labels: Tensor) -> Tensor:
@@ -500,6 +475,150 @@ def _acceleration_gradient(logits: Tensor, labels: Tensor) -> Tensor:
     gradient = logits.softmax(1)
     gradient.scatter_add_(1, labels, gradient.new_full((), -1.0).expand_as(labels))
     return gradient.div_(logits.shape[2])
+
+
+# --- seeds shared out to processes ----------------------------------------------------------------------------------
+
+
+class Task(NamedTuple):
+    """What every share of the seeds learns from, as it goes through a pipe."""
+
+    settings: PolicySettings
+    scaling: Arrays
+    train: Labelled
+    test: Labelled
+
+
+class Trained(NamedTuple):
+    """What becomes of a share: see TrainedPolicies."""
+
+    weights: Arrays
+    acceleration: NDArray[np.uint8]
+    steering: NDArray[np.float32]
+
+
+class Shares:
+    """Seeds in shares: the first is trained in this process, each other in a process beside it.
+
+    `after_epoch(epoch, {split: METRICS [4, S]})` hears of an epoch when all shares have measured it, of all seeds in
+    their order. Leaving the block ends the processes.
+    """
+
+    def __init__(self, shares: Sequence[NDArray[np.int64]], task: Task, after_epoch: AfterEpoch) -> None:
+        self._shares, self._task, self._after_epoch = [share.tolist() for share in shares], task, after_epoch
+        self._measured: list[deque[Arrays]] = [deque() for _ in shares]
+        self._epoch = 0
+        self._trained: dict[int, Trained] = {}
+        self._processes: dict[Connection, tuple[int, BaseProcess]] = {}
+
+    def __enter__(self) -> Self:
+        for number, seeds in enumerate(self._shares[1:], 1):
+            here, there = multiprocessing.Pipe()
+            context = multiprocessing.get_context("spawn")  # a fork would copy the locks of torch's threads
+            process = context.Process(target=_serve, args=(there,), name=f"policies {seeds}", daemon=True)
+            with deaf_to_interrupts():
+                process.start()
+            there.close()
+            self._processes[here] = number, process
+            # In a thread: it is taken in only when the process has loaded torch.
+            threading.Thread(target=_send, args=(here, (seeds, self._task)), daemon=True).start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for pipe, (_, process) in self._processes.items():
+            process.kill()
+            process.join()
+            pipe.close()
+
+    def train(self, device: str) -> list[Trained]:
+        """Train the first share, and wait for the others."""
+
+        def after_epoch(_: int, values: Arrays) -> None:
+            self._measured[0].append(values)
+            self._listen(timeout=0)
+
+        self._trained[0] = _train_share(self._shares[0], self._task, device, after_epoch)
+        while len(self._trained) < len(self._shares):
+            self._listen(timeout=None)
+        return [self._trained[number] for number in range(len(self._shares))]
+
+    def _listen(self, timeout: float | None) -> None:
+        """Take what has come from the others, and tell of the epochs that all have measured."""
+        waiting = [pipe for pipe, (number, _) in self._processes.items() if number not in self._trained]
+        ready = wait(waiting, timeout) if waiting else []
+        for pipe in waiting:
+            if pipe in ready:
+                self._take(pipe)
+        while all(self._measured):
+            parts = [measured.popleft() for measured in self._measured]
+            self._epoch += 1
+            self._after_epoch(
+                self._epoch, {split: np.concatenate([part[split] for part in parts], 1) for split in parts[0]}
+            )
+
+    def _take(self, pipe: Connection) -> None:
+        number, process = self._processes[pipe]
+        try:
+            told = pipe.recv()
+        except (EOFError, ConnectionError) as error:
+            process.join()
+            raise ChildProcessError(
+                f"the process that trained policy seeds {self._shares[number]} ended with code {process.exitcode}"
+            ) from error
+        if isinstance(told, Exception):
+            raise told
+        if isinstance(told, Trained):
+            self._trained[number] = told
+        else:
+            self._measured[number].append(told)
+
+
+def _send(pipe: Connection, what: tuple[list[int], Task]) -> None:
+    with suppress(OSError):  # the process has ended: whoever listens to it will know
+        pipe.send(what)
+
+
+def _serve(parent: Connection) -> None:
+    """In a process of its own: train the share that comes through the pipe, and send back what is told of it."""
+    obey_parent()
+    try:
+        seeds, task = parent.recv()
+        parent.send(_train_share(seeds, task, "cpu", lambda _, values: parent.send(values)))
+    except Exception as error:  # noqa: BLE001 - whatever it is, the parent has to know
+        error.add_note(traceback.format_exc())
+        with suppress(OSError):  # the parent may be gone
+            parent.send(error)
+
+
+def _train_share(seeds: Sequence[int], task: Task, device: str, after_epoch: AfterEpoch) -> Trained:
+    """Train some of the seeds in this process."""
+    data = _policy_data(task, torch.device(device))
+    with _one_thread():
+        ensemble = PolicyEnsemble(seeds, task.settings, data, after_epoch)
+        _fit(ensemble, task.settings, math.ceil(len(data.x) / task.settings.batch), device)
+        steering, logits = ensemble.outputs(data.views["test"][0])
+    return Trained(ensemble.weights(), logits.argmax(2).to(torch.uint8).cpu().numpy(), steering.cpu().numpy())
+
+
+def _processes(seeds: int, frames: int, device: str) -> int:
+    """How many processes train `seeds` policies that see `frames` each: as many as torch has threads, where it pays."""
+    if device != "cpu" or seeds * frames < _WORTH:
+        return 1
+    return min(torch.get_num_threads(), cores(), seeds)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Torch's threads inside of an operation would wait for each other forty times a step."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+# --- all of it ------------------------------------------------------------------------------------------------------
 
 
 def train_policies(
@@ -518,12 +637,13 @@ def train_policies(
 
     Train metrics are taken on a random part of the train split, the same for all seeds and epochs, that is no larger
     than the test split. `log(epoch, means over the seeds)` with names such as "test/acceleration_accuracy".
-    Raises BadInputError for data that cannot be learnt from, TrainingDivergedError for a loss that is not finite.
+    Raises BadInputError for data that cannot be learnt from, TrainingDivergedError for a loss that is not finite,
+    ChildProcessError where a process beside this one was killed.
     """
     started = time.perf_counter()
     _check(z_train, z_test, labels_train, labels_test, seeds, settings)
     scaling = normalisation(z_train, settings.normalise)
-    data = _policy_data(scaling, (z_train, labels_train), (z_test, labels_test), torch.device(device))
+    task = Task(settings, scaling, (z_train, _asked(labels_train)), (z_test, _asked(labels_test)))
     points: list[pd.DataFrame] = []
 
     def after_epoch(epoch: int, values: Arrays) -> None:
@@ -547,17 +667,22 @@ def train_policies(
         if progress:
             progress(epoch, settings.epochs)
 
-    with _crew(device) as crew:
-        ensemble = PolicyEnsemble(seeds, settings, data, crew, after_epoch)
-        _fit(ensemble, settings, math.ceil(len(z_train) / settings.batch), device)
-        steering, logits = ensemble.outputs(data.views["test"][0])
+    processes = _processes(len(seeds), len(z_train) * settings.epochs, device)
+    with Shares(np.array_split(np.array(seeds), processes), task, after_epoch) as shares:
+        trained = shares.train(device)
     return TrainedPolicies(
-        weights=ensemble.weights() | scaling,
+        weights={name: np.concatenate([share.weights[name] for share in trained]) for name in trained[0].weights}
+        | scaling,
         curves=pd.concat(points, ignore_index=True)[list(CURVE_COLUMNS)],
-        acceleration=logits.argmax(2).to(torch.uint8).cpu().numpy(),
-        steering=steering.cpu().numpy(),
+        acceleration=np.concatenate([share.acceleration for share in trained]),
+        steering=np.concatenate([share.steering for share in trained]),
         seconds=time.perf_counter() - started,
     )
+
+
+def _asked(labels: pd.DataFrame) -> pd.DataFrame:
+    """The columns that policies learn."""
+    return labels[["steering", "acceleration"]]
 
 
 def _check(
@@ -588,21 +713,16 @@ def _check(
         )
 
 
-def _policy_data(
-    scaling: Arrays,
-    train: tuple[NDArray[Any], pd.DataFrame],
-    test: tuple[NDArray[Any], pd.DataFrame],
-    device: torch.device,
-) -> PolicyData:
+def _policy_data(task: Task, device: torch.device) -> PolicyData:
     (x_train, y_train), (x_test, y_test) = (
         (
-            torch.from_numpy(normalise(scaling, z)).to(device),
+            torch.from_numpy(normalise(task.scaling, z)).to(device),
             Labels(
                 torch.from_numpy(np.array(labels["steering"], np.float32)).to(device),
                 torch.from_numpy(np.array(labels["acceleration"], np.int64)).to(device),
             ),
         )
-        for z, labels in (train, test)
+        for z, labels in (task.train, task.test)
     )
     some = np.random.default_rng(_SUBSET).permutation(len(x_train))[: len(x_test)]
     part = torch.from_numpy(np.sort(some)).to(device)
@@ -619,21 +739,6 @@ def _points(seeds: Sequence[int], epoch: int, values: dict[str, NDArray[Any]]) -
         .reset_index()
         .assign(stage="policy", epoch=epoch)
     )
-
-
-@contextmanager
-def _crew(device: str) -> Iterator[Crew | None]:
-    if device != "cpu":
-        yield None
-        return
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # threads that wait inside of torch would take the cores from the crew
-    crew = Crew(threads)
-    try:
-        yield crew
-    finally:
-        crew.close()
-        torch.set_num_threads(threads)
 
 
 def _fit(ensemble: PolicyEnsemble, settings: PolicySettings, steps: int, device: str) -> None:

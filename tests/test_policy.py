@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
 import itertools
@@ -95,7 +94,7 @@ def test_all_seeds_as_one_group_come_out_as_one_group_each(
     fifteen: TrainedPolicies, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The way of a GPU, taken on a CPU."""
-    monkeypatch.setattr(policy, "_crew", lambda device: contextlib.nullcontext())
+    monkeypatch.setattr(policy, "_groups", lambda seeds, device: [slice(0, seeds)])
     together = train(range(15))
     np.testing.assert_allclose(together.steering, fifteen.steering, rtol=1e-3, atol=1e-4)
     np.testing.assert_allclose(
@@ -116,7 +115,7 @@ def test_inside_an_epoch_nobody_waits_for_the_device(monkeypatch: pytest.MonkeyP
             step(*arguments)
 
     monkeypatch.setattr(policy.PolicyEnsemble, "training_step", watched)
-    monkeypatch.setattr(policy, "_crew", lambda device: contextlib.nullcontext())
+    monkeypatch.setattr(policy, "_groups", lambda seeds, device: [slice(0, seeds)])
     train()
     assert asked == []
 
