@@ -4,9 +4,10 @@ Encoder: `train_encoder` as a sweep calls it (Lightning, checkpoints, progress a
 bare torch loop over tensors in memory with the same networks, precision and optimiser, turn about by the epoch, and
 against a stock Lightning template with a DataLoader of two workers (`plain.py`). Policies: all 15 seeds by
 `train_policies` against one plain fit after the other. An epoch is all of it: training, evaluating the test split,
-reporting; of policies also its part of starting the processes. Data are random: values cost no time. Printed are medians with the lowest and highest; the floor of a stage
-is what its multiplications take at the speed of a large matrix product on this machine, or its bytes at the speed of a
-copy, whichever takes longer. `--quick` tries everything on almost no data, and keeps nothing.
+reporting; of policies also its part of starting the processes. Data are random: values cost no time. Printed are
+medians with the lowest and highest; the floor of a stage is what its multiplications take at the speed of a large
+matrix product on this machine, or its bytes at the speed of a copy, whichever takes longer. `--quick` tries everything
+on almost no data, and keeps nothing.
 """
 
 from __future__ import annotations

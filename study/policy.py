@@ -510,6 +510,7 @@ class Shares:
         self._epoch = 0
         self._trained: dict[int, Trained] = {}
         self._processes: dict[Connection, tuple[int, BaseProcess]] = {}
+        self._senders: list[threading.Thread] = []
 
     def __enter__(self) -> Self:
         for number, seeds in enumerate(self._shares[1:], 1):
@@ -521,13 +522,17 @@ class Shares:
             there.close()
             self._processes[here] = number, process
             # In a thread: it is taken in only when the process has loaded torch.
-            threading.Thread(target=_send, args=(here, (seeds, self._task)), daemon=True).start()
+            self._senders.append(threading.Thread(target=_send, args=(here, (seeds, self._task)), daemon=True))
+            self._senders[-1].start()
         return self
 
     def __exit__(self, *error: object) -> None:
-        for pipe, (_, process) in self._processes.items():
+        for _, process in self._processes.values():
             process.kill()
             process.join()
+        for sender in self._senders:
+            sender.join()
+        for pipe in self._processes:
             pipe.close()
 
     def train(self, device: str) -> list[Trained]:
