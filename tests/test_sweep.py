@@ -104,7 +104,7 @@ def test_a_failed_cell_leaves_the_others_is_told_and_runs_again_when_asked_for(f
         assert "failed: rec 100% e0" in done.stderr
         assert "failed: rec+pred 100% e0" in done.stderr
         assert "epoch" in done.stderr
-        assert "--no-report --retry-failed\n" in done.stderr
+        assert " --retry-failed\n" in done.stderr
         assert runs(tmp_path) == {"FAILED": tries}
 
 
