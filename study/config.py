@@ -384,8 +384,8 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def named_files(folder: Path) -> dict[str, Path]:
-    """Name -> path of the YAML files in a folder."""
-    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+    """Name -> path of the YAML files in a folder, by name."""
+    return {path.stem: path for path in sorted(folder.glob("*.yaml"), key=lambda path: path.stem)}
 
 
 def explain(error: ValidationError, source: str) -> BadInputError:
