@@ -22,6 +22,7 @@ COLUMNS = {  # with their widths in pixels
     "metrics.`floor`": 80,
     "tags.`sweep`": 110,
 }
+CHARTS = "policy/test/(steering_loss|acceleration_accuracy)$"  # of the many there are; a regular expression
 
 
 def welcome(experiment: str, there: Mapping[str, str]) -> dict[str, str]:
@@ -65,5 +66,6 @@ def _view() -> dict[str, Any]:
         "selectedColumns": list(COLUMNS),
         "columnOrder": list(COLUMNS),
         "columnWidths": COLUMNS,
-        "runsVisibilityMode": "SHOWALL",  # MLflow draws ten runs otherwise, and the others are missed
+        "runsHiddenMode": "SHOW_ALL",  # MLflow draws ten runs otherwise, and the others are missed
+        "chartsSearchFilter": CHARTS,
     }

@@ -172,7 +172,12 @@ class TrackingServer:
                 stdout=stream,
                 stderr=stream,
                 start_new_session=True,  # its own workers end with it
-                env=os.environ | {"MLFLOW_BACKEND_STORE_URI": self._store, "MLFLOW_DISABLE_TELEMETRY": "true"},
+                env=os.environ
+                | {
+                    "MLFLOW_BACKEND_STORE_URI": self._store,
+                    "MLFLOW_DISABLE_TELEMETRY": "true",
+                    "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false",  # eight more processes, for GenAI jobs
+                },
             )
         try:
             _await(self._process, self._answers, log)

@@ -1,0 +1,222 @@
+"""What a person sees of a sweep in MLflow's own pages, on a real server.
+
+Everything is checked by the requests that the pages make. Where a browser is found it is checked on the pages, too:
+no package of a lock file carries one that starts without libraries of the system.
+"""
+
+import http.client
+import json
+import re
+import tempfile
+import urllib.parse
+from pathlib import Path
+
+import mlflow
+import pytest
+import torch
+
+from browser import Browser, program
+from drives import write_drives
+from servers import LOOPBACK, TrackingServer
+from simulated import HEADS_GRID, World, simulate
+from study.card import card_files
+from study.config import BirdviewSettings, FramesSettings
+from study.exported import export_driver
+from study.frames import build_frames, open_frames
+from study.tracking import Tracker
+
+pytestmark = pytest.mark.slow
+
+ACCURACY, STEERING = "policy/test/acceleration_accuracy", "policy/test/steering_loss"
+COLUMNS = ("heads", "fraction", "encoder_seed", "policy_seeds", "state", "final/acceleration_accuracy")
+LABELS = ("full 100% e0", "rec 100% e0", "rec+plan 100% e0", "rec+pred 100% e0")
+EPOCHS, SEEDS = 8, 2
+REFERENCE = Path(__file__).parents[1] / "reports" / "reference" / "heads"
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory):
+    running = TrackingServer(tmp_path_factory.mktemp("ui"))
+    yield running
+    running.stop()
+
+
+@pytest.fixture(scope="module")
+def sweep(server, tmp_path_factory):
+    """A finished sweep of the four head sets: drawn curves, a real report, the card of real frames, models."""
+    made = tmp_path_factory.mktemp("sweep")
+    drives = write_drives(made / "drives", 4)
+    build_frames(FramesSettings(encoder=40, policy=20), BirdviewSettings(), drives[:2], drives[2:], made / "frames", 1)
+    record = simulate(HEADS_GRID.model_copy(update={"policy_seeds": SEEDS, "ceiling": False}), World(epochs=EPOCHS))
+    tracker = Tracker(server.uri)
+    run_id = tracker.open_sweep(
+        record.grid, record.profile, record.settings, record.planned, record.data, record.provenance
+    )
+    tracker.log_files(run_id, card_files(open_frames(made / "frames"), drives, made / "frames"), "data")
+    tracker.log_files(run_id, [REFERENCE / "report.pdf"], "report")
+    tracker.log_files(run_id, [REFERENCE / "test_compare_heads.png"], "figures")
+    network = export_driver(next(iter(record.results.values())), made / "network.pt2")  # drawn weights are all the same
+    for key, cell in record.planned.items():
+        run = tracker.start_cell(run_id, cell, key, record.settings, SEEDS)
+        tracker.commit(run, record.results[key], network)
+    tracker.close_sweep(run_id, "FINISHED")
+    return run_id
+
+
+def ask(server, path, **body):
+    """A page's own request: POST where it has a body."""
+    connection = http.client.HTTPConnection(LOOPBACK, server.port, timeout=120)
+    words = ("POST", json.dumps(body), {"Content-Type": "application/json"}) if body else ("GET", None, {})
+    connection.request(words[0], f"/{path}", *words[1:])
+    answer = connection.getresponse()
+    content = answer.read()
+    assert answer.status == 200, content
+    return content
+
+
+def api(server, path, **body):
+    return json.loads(ask(server, f"ajax-api/2.0/mlflow/{path}", **body))
+
+
+@pytest.fixture(scope="module")
+def experiment(server, sweep):
+    found = api(server, "experiments/search", max_results=10, order_by=["last_update_time DESC"])["experiments"]
+    (mine,) = [each for each in found if each["name"] == "study"]
+    return mine["experiment_id"], {tag["key"]: tag["value"] for tag in mine["tags"]}
+
+
+@pytest.fixture(scope="module")
+def address(server, experiment):
+    """Where the link in the experiment's description leads."""
+    link = re.search(r"\[All cells with their scores\]\((.+?)\)", experiment[1]["mlflow.note.content"]).group(1)
+    return f"{server.uri}/{link}"
+
+
+def runs(server, experiment, query):
+    found = api(server, "runs/search", experiment_ids=[experiment[0]], filter=query, max_results=100)["runs"]
+    return {run["info"]["run_name"]: run for run in found}
+
+
+@pytest.fixture(scope="module")
+def cells(server, experiment):
+    view = json.loads(experiment[1]["mlflow.sharedViewState.cells"])
+    return runs(server, experiment, view["searchFilter"])
+
+
+# --- by the pages' requests -----------------------------------------------------------------------------------------
+
+
+def test_the_view_lists_the_cells_with_all_that_its_columns_name(cells, experiment):
+    assert tuple(sorted(cells)) == LABELS
+    wanted = json.loads(experiment[1]["mlflow.sharedViewState.cells"])["selectedColumns"]
+    assert [re.search("`(.+)`", column).group(1) for column in wanted][:6] == list(COLUMNS)
+    for name, run in cells.items():
+        there = {
+            f"{kind}.`{item['key']}`": item["value"]
+            for kind in ("params", "metrics", "tags")
+            for item in run["data"][kind]
+        }
+        assert set(wanted) <= set(there)
+        assert there["params.`heads`"] == name.split()[0]
+        assert there["tags.`state`"] == "finished"
+        assert len(str(there["metrics.`final/acceleration_accuracy`"])) <= len("0.12345")
+        assert "mlflow.note.content" in {tag["key"] for tag in run["data"]["tags"]}
+
+
+def test_nothing_is_running_when_the_sweep_has_ended(server, experiment):
+    assert {run["info"]["status"] for run in runs(server, experiment, "").values()} == {"FINISHED"}
+
+
+@pytest.mark.parametrize("metric", [ACCURACY, STEERING])
+def test_a_comparison_of_the_cells_gets_a_whole_mean_curve_of_each(server, cells, metric):
+    names = [("run_ids", run["info"]["run_id"]) for run in cells.values()]
+    words = urllib.parse.urlencode([*names, ("metric_key", metric), ("max_results", 320)])
+    points = api(server, f"metrics/get-history-bulk-interval?{words}")["metrics"]
+    for _, run_id in names:
+        assert [point["step"] for point in points if point["run_id"] == run_id] == list(range(1, EPOCHS + 1))
+
+
+def test_report_figures_card_and_manifest_are_served(server, sweep):
+    def files(path):
+        found = api(server, f"artifacts/list?run_id={sweep}&path={path}").get("files", [])
+        return {Path(file["path"]).name for file in found}
+
+    assert {"report", "figures", "data", "data.json", "plan.json"} <= files("")
+    assert files("data") == {"card.json", "card.txt", "card.png"}
+    starts = {"report/report.pdf": b"%PDF", "figures/test_compare_heads.png": b"\x89PNG", "data/card.png": b"\x89PNG"}
+    for path, start in starts.items():
+        assert ask(server, f"get-artifact?path={path}&run_uuid={sweep}").startswith(start)
+    assert "sets" in json.loads(ask(server, f"get-artifact?path=data.json&run_uuid={sweep}"))
+
+
+def test_each_cell_has_its_model(server, experiment, cells):
+    found = api(server, "logged-models/search", experiment_ids=[experiment[0]])["models"]
+    sources = {model["info"]["source_run_id"] for model in found}
+    assert sources == {run["info"]["run_id"] for run in cells.values()}
+    assert {model["info"]["status"] for model in found} == {"LOGGED_MODEL_READY"}
+
+
+def test_a_model_comes_back_from_the_server(server, cells, monkeypatch):
+    monkeypatch.setenv("MLFLOW_ALLOW_PICKLE_DESERIALIZATION", "false")
+    before = mlflow.get_tracking_uri()
+    mlflow.set_tracking_uri(server.uri)
+    try:
+        driver = mlflow.pytorch.load_model(f"runs:/{cells['full 100% e0']['info']['run_id']}/driver")
+    finally:
+        mlflow.set_tracking_uri(before)
+    answer = driver(torch.zeros(5, 3, 64, 64))
+    assert torch.equal(answer["steering"], torch.zeros(SEEDS, 5))  # so the drawn policies say
+    assert answer["acceleration"].shape == (SEEDS, 5, 3)
+
+
+# --- by the pages themselves ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def browser():
+    if program() is None:
+        pytest.skip("no Chromium on this machine; the pages' requests are checked all the same")
+    # A short path: Chromium keeps a socket below it.
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as name, Browser(Path(name), (2600, 1000)) as opened:
+        yield opened
+
+
+SHOWN = "document.body.innerText.includes({})"
+# Charts whose lines end at as many different values as there are cells; MLflow draws each line twice.
+DRAWN = """[...document.querySelectorAll('.js-plotly-plot')].filter(plot => plot.data && new Set(plot.data
+    .filter(line => line.y && line.y.length == {points}).map(line => line.y[line.y.length - 1])).size == {lines})
+    .length == {charts}"""
+
+
+def test_the_list_of_cells_as_a_person_sees_it(browser, address, cells):
+    browser.open(address)
+    for label in LABELS:
+        browser.wait(SHOWN.format(json.dumps(label)))
+    text = browser.text()
+    for column in COLUMNS:
+        assert column in text
+    assert text.count("finished") == len(LABELS)
+    for run in cells.values():
+        (accuracy,) = [m["value"] for m in run["data"]["metrics"] if m["key"] == "final/acceleration_accuracy"]
+        assert str(accuracy) in text
+
+
+def test_the_charts_of_the_cells_are_mean_curves(browser, address):
+    browser.open(f"{address}&compareRunsMode=CHART")
+    browser.wait(DRAWN.format(points=EPOCHS, lines=len(LABELS), charts=2))
+
+
+def test_the_report_opens_where_it_was_filed(browser, server, experiment, sweep):
+    page = f"{server.uri}/#/experiments/{experiment[0]}/runs/{sweep}/artifacts"
+    browser.open(f"{page}/report/report.pdf?workflowType=machine_learning")
+    browser.wait("[...document.querySelectorAll('canvas')].some(page => page.width > 100 && page.height > 100)")
+    browser.open(f"{page}/figures/test_compare_heads.png?workflowType=machine_learning")
+    browser.wait("[...document.images].some(image => image.complete && image.naturalWidth > 500)")
+    assert {"data.json", "plan.json"} <= set(browser.text().split())
+
+
+def test_the_models_are_listed(browser, server, experiment):
+    browser.open(f"{server.uri}/#/experiments/{experiment[0]}/models?workflowType=machine_learning")
+    for label in LABELS:
+        browser.wait(SHOWN.format(json.dumps(label)))
+    assert "driver" in browser.text()
