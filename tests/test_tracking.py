@@ -389,7 +389,7 @@ def test_a_sweep_is_read_back_from_the_store_alone(tracker, uri):
     assert record.data == DATA
     assert record.provenance == ORIGIN
     assert list(record.table()["heads"].unique()) == ["full", "rec"]
-    assert tracker.client.get_run(sweep).data.tags["cells"] == "2 of 2 finished"
+    assert tracker.client.get_run(sweep).data.tags["cells"] == "3 of 3 finished"
 
 
 def test_the_same_plan_takes_the_same_run_up_again(tracker):
@@ -642,5 +642,5 @@ def test_a_server_lost_in_the_middle_is_one_clear_error_and_nothing_is_doubled_a
     assert tracker.commit(run, result) == run.run_id
     assert_no_point_twice(tracker, run.run_id)
     record = tracker.read_sweep("heads")
-    assert record.complete
+    assert set(record.results) == {"server-0", "server-1"}
     assert_same_result(record.results["server-1"], result)
