@@ -221,6 +221,7 @@ class Tracker:
                 created = self._create(name, identity)
                 run_id = str(self._search(f"tags.plan_key = '{key}'")[0].info.run_id)
                 if created != run_id:  # a server has no lock: of two parents started at once, both take the first
+                    self.client.set_terminated(created, "KILLED")
                     self.client.delete_run(created)
             for run in sweeps:
                 # A database file belongs to one machine, where one sweep runs at a time: others were killed.

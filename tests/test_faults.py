@@ -1,24 +1,30 @@
 """Sweeps that are killed, stopped, starved and fed with garbage end like one that was left alone."""
 
 import os
+import random
 import re
 import shutil
 import signal
 import subprocess
+import sys
 import time
+from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import pytest
 
-from running import ROOT, Running, check_like, command, leftovers, store, working_folder
+from running import ROOT, Running, Store, check_like, command, leftovers, store, working_folder
+from servers import TrackingServer
 
 pytestmark = pytest.mark.slow
 
 TINY = ("heads", "--profile", "tiny", "--policy_seeds", "2", "--threads", "1", "--ceiling", "false")
 FOUR = (*TINY, "--workers", "2")
 TWO = (*FOUR, "--heads", "[rec,full]")
+EIGHT = (*TINY, "--encoder_seeds", "2")
 QUIET_SECONDS = 20.0  # of the undisturbed run on two quiet cores
 HINT = "Nothing that was finished is lost"
 
@@ -42,19 +48,78 @@ def quiet(tmp_path_factory):
     return Quiet(folder, max(1.0, (time.monotonic() - began) / QUIET_SECONDS))
 
 
+# --- the storm ------------------------------------------------------------------------------------------------------
+
+
 def entries(folder, pattern):
     """Whether there is a file or folder of that pattern, hidden ones included."""
     return any(True for _ in folder.glob(pattern))
 
 
+def made(run, pattern):
+    """Whether children make data now, and something of that pattern is there."""
+    return run.of("data") and entries(run.folder, pattern)
+
+
 SIGNS = {  # of a stage: something is going on
     "start": lambda run: True,
-    "record": lambda run: entries(run.folder, "data/episodes/*/*") and not entries(run.folder, "data/frames/*"),
-    "render": lambda run: entries(run.folder, "data/frames/.*.building"),
+    "record": lambda run: made(run, "data/episodes/*/*") and not entries(run.folder, "data/frames/*"),
+    "render": lambda run: made(run, "data/frames/.*.building"),
     "cell": lambda run: run.of("cell"),
-    "commit": lambda run: entries(run.folder, "data/cells/[!.]*"),
+    "commit": lambda run: "cells finished" in run.said and entries(run.folder, "data/cells/[!.]*"),
     "report": lambda run: "writing the report" in run.said,
 }
+LENGTH = {"start": 3.0, "record": 1.0, "render": 0.6, "cell": 0.8, "commit": 0.4, "report": 2.0}  # [s] after the sign
+STORM = 30  # kills at least
+BLOWS = (  # stage, who is killed, how often; in the order in which a sweep gets there
+    (("start", "parent", 1), ("record", "parent", 1), ("record", "data", 2)),
+    (("render", "parent", 1), ("render", "data", 2)),
+    (
+        ("start", "parent", 1),
+        ("cell", "cell", 12),
+        ("cell", "server", 2),
+        ("cell", "parent", 2),
+        ("commit", "parent", 2),
+    ),
+    (("report", "parent", 1),),
+)
+
+
+def test_a_storm_of_kills_changes_nothing(quiet, tmp_path):
+    """SIGKILL at random moments of every stage, to the parent and to each kind of child."""
+    rng = random.Random("storm")
+    folder = working_folder(tmp_path)
+    run = Running(folder, *command(*FOUR))
+    kills, kept = Counter(), set()
+    for phase in BLOWS:
+        blows = [(stage, role) for stage, role, times in phase for _ in range(times)]
+        rng.shuffle(blows)
+        while blows:
+            stage, role = blows[-1]
+            if not run.running:
+                run = Running(folder, *command(*FOUR))
+            if not run.until(lambda run=run, stage=stage: SIGNS[stage](run)):
+                if run.end() == 0 and stage != "report":  # nothing is left that could be hit there
+                    break
+                continue
+            time.sleep(rng.uniform(0, LENGTH[stage]))
+            if sent := run.send(signal.SIGKILL, *run.of(role)):
+                kills[f"{stage}: {role}"] += sent
+                blows.pop()
+            if role == "parent":
+                run.end()
+                found = set(store(folder).folders())
+                assert kept <= found, "a finished cell was lost"
+                kept = found
+            if stage == "report" and not blows and kills.total() < STORM:
+                blows.append((stage, role))
+    if run.running:
+        run.end()
+    run = Running(folder, *command(*FOUR))
+    assert run.end() == 0, run.said
+    print("kills", dict(kills), "runs of cells", dict(store(folder).cells()))
+    assert kills.total() >= STORM
+    check_like(folder, quiet.folder)
 
 
 # --- one machine, one fault at a time -------------------------------------------------------------------------------
@@ -211,3 +276,85 @@ def test_a_full_disk_is_told_at_every_stage_and_costs_nothing(quiet, disk, tmp_p
     run = Running(disk.folder, *command(*TWO), log=tmp_path / "log")
     assert run.end() == 0, run.said
     check_like(disk.folder, quiet.folder)
+
+
+# --- many machines --------------------------------------------------------------------------------------------------
+
+
+class Lab:
+    """Two sweeps started at once and a worker, each with a working folder of its own, around one queue and server."""
+
+    modules: ClassVar = {"one": "study.sweep", "two": "study.sweep", "three": "study.worker"}
+
+    def __init__(self, folder, data, *words):
+        self.where = {name: working_folder(folder / name, data) for name in self.modules}
+        self._words, self._rng = words, random.Random("lab")
+        self.kills = Counter()
+        self.crew = {name: self._begin(name) for name in self.modules}
+
+    def _begin(self, name):
+        return Running(self.where[name], sys.executable, "-m", self.modules[name], *EIGHT, *self._words)
+
+    def begin_again(self, name):
+        self.crew[name].end()
+        self.crew[name] = self._begin(name)
+
+    def await_cell(self, name):
+        assert self.crew[name].until(lambda: self.crew[name].of("cell")), self.crew[name].said
+
+    def kill(self, name, role):
+        """Kill a child, or a sweep's or worker's process."""
+        self.kills[f"{self.modules[name]}: {role}"] += self.crew[name].send(signal.SIGKILL, *self.crew[name].of(role))
+
+    def hit(self, name, role):
+        """The same soon after a cell was begun."""
+        self.await_cell(name)
+        time.sleep(self._rng.uniform(0, LENGTH["cell"]))
+        self.kill(name, role)
+
+
+def test_a_shared_queue_survives_kills_stops_and_lost_servers(quiet, postgres, tmp_path):
+    alone = working_folder(tmp_path / "alone", quiet.folder)
+    undisturbed = Running(alone, *command(*EIGHT, "--workers", "2"))
+    queue, database = postgres.uri(), postgres.uri()
+    server = TrackingServer(tmp_path / "server", database)
+    kept = Store(database, tmp_path / "server/files")
+    grace = str(round(3 + 2 * quiet.pace))
+    lab = Lab(tmp_path, quiet.folder, "--queue", queue, "--tracking", server.uri, "--grace", grace, "--workers", "1")
+    try:
+        lab.hit("one", "cell")
+        lab.hit("two", "cell")
+        lab.await_cell("three")
+        postgres.stop()
+        lab.kill("three", "cell")
+        server.stop()
+        time.sleep(2)
+        postgres.start()
+        server.start()
+        finished = set()
+        for name in ("one", "three"):
+            lab.hit(name, "parent")
+            lab.begin_again(name)
+            assert finished <= set(kept.folders()), "a finished cell was lost"
+            finished = set(kept.folders())
+
+        # One that has a cell stands still until the others have finished all.
+        lab.await_cell("two")
+        family = list(lab.crew["two"].family())
+        lab.crew["two"].send(signal.SIGSTOP, *family)
+        assert [lab.crew[name].end() for name in ("one", "three")] == [0, 0], lab.crew["one"].said
+        assert len(kept.folders()) == 8
+        lab.crew["two"].send(signal.SIGCONT, *family)
+        assert lab.crew["two"].end() == 0, lab.crew["two"].said
+
+        assert undisturbed.end() == 0, undisturbed.said
+        print("kills", dict(lab.kills), "runs of cells", dict(kept.cells()))
+        assert lab.kills.total() >= 4
+        for name in ("one", "two"):
+            check_like(lab.where[name], alone, kept)
+        assert leftovers(lab.where["three"]) == []
+        assert not any(postgres.password in path.read_text() for path in tmp_path.glob("*/log"))
+    finally:
+        server.stop()
+        for run in (undisturbed, *lab.crew.values()):
+            run.send(signal.SIGKILL, *run.family())

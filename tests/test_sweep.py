@@ -1,13 +1,11 @@
-"""The whole way on the smoke profile: from an empty folder to the PDF, stopped and started again."""
+"""The whole way on the smoke profile: from an empty folder to the PDF."""
 
 import json
 import os
 import shutil
-import signal
 import sqlite3
 import subprocess
 import sys
-import time
 from collections import Counter
 from pathlib import Path
 
@@ -129,25 +127,3 @@ def test_a_result_tells_what_made_it(folder):
     assert told["threads"] == 1
     assert told["provenance"]["determinism"].keys() >= {"deterministic_algorithms", "cudnn_benchmark", "matmul_tf32"}
     assert told["provenance"]["seeds"]["policies"] == [0, 1, 2]
-
-
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
-def test_a_stopped_sweep_goes_on_and_ends_like_one_that_was_not(folder, tmp_path, how):
-    take(folder, tmp_path)
-    process = subprocess.Popen(
-        command("heads", *SMALL, *TWO, *LESS), cwd=tmp_path, stderr=subprocess.PIPE, text=True, env=environment()
-    )
-    for line in process.stderr:
-        if "encoder, epoch" in line or "starting" in line:
-            break
-    time.sleep(5)
-    process.send_signal(how)
-    said = process.stderr.read()
-    assert process.wait(10) != 0
-    assert how == signal.SIGKILL or "To go on: python -m study.sweep heads" in said
-
-    done = sweep(tmp_path, "heads", *SMALL, *TWO, *LESS)
-    assert done.returncode == 0, done.stderr
-    assert runs(tmp_path)["FINISHED"] == 2
-    assert runs(tmp_path)["RUNNING"] == 0
-    assert table(tmp_path).to_csv() == table(folder).to_csv()
