@@ -142,7 +142,8 @@ class Store:
                 return connection.execute(query).fetchall()
         if not self.database.is_file():
             return []
-        with closing(sqlite3.connect(f"file:{self.database}?mode=ro", uri=True, timeout=60)) as database:
+        # Opened for writing: SQLite undoes what a killed process has left half written before anyone can read.
+        with closing(sqlite3.connect(f"file:{self.database}?mode=rw", uri=True, timeout=60)) as database:
             return database.execute(query).fetchall()
 
     def cells(self) -> Counter[str]:

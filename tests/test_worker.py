@@ -114,7 +114,7 @@ def test_three_workers_one_of_them_killed_give_the_table_of_one_machine(postgres
     assert record.complete
     assert record.table().equals(Tracker(f"sqlite:///{alone}/mlruns/mlflow.db").read_sweep("heads").table())
     statuses = [attempt.status for tries in tracker.attempts(list(record.planned)).values() for attempt in tries]
-    assert Counter(statuses) == {"FINISHED": CELLS, "KILLED": len(statuses) - CELLS}
+    assert Counter(status for status in statuses if status != "KILLED") == {"FINISHED": CELLS}
     assert (lead / "reports/heads.pdf").is_file()
     assert "there already" in said(second)
     assert "made here from their key" in said(third)
