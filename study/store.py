@@ -5,7 +5,6 @@ Whoever imports from mlflow imports this first, since mlflow reads its environme
 
 from __future__ import annotations
 
-import fcntl
 import os
 import re
 import shutil
@@ -18,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from study.command import alone
 from study.config import DEFAULT_TRACKING, BadInputError, masked
 
 # Nothing phones home, nothing is printed. A lost server is asked again for about half a minute, MLflow's own default
@@ -169,17 +169,6 @@ def few_tries(seconds: float = PROBE) -> Iterator[None]:
         for name, value in before.items():
             if value is not None:
                 os.environ[name] = value
-
-
-@contextmanager
-def alone(lock: Path | None) -> Iterator[None]:
-    """Hold a file's lock; a process that dies lets go of it. Without a file there is nothing to hold."""
-    if lock is None:
-        yield
-        return
-    with lock.open("w") as stream:
-        fcntl.flock(stream, fcntl.LOCK_EX)
-        yield
 
 
 def _probe(uri: str, shown: str) -> None:

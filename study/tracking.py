@@ -27,12 +27,13 @@ from typing import Any, Literal, Self
 
 import pandas as pd
 
+from study.command import alone
 from study.config import DEFAULT_TRACKING, BadInputError, Cell, Grid, StudySettings, content_key, masked
 from study.confounds import contrasts, varied
 from study.mlmodel import log_model
 from study.points import COMMIT, Point, bands, cell_points, facts_of, flatten, points, scores_of
 from study.result import ARRAYS, CellResult, SweepRecord
-from study.store import BUSY, TROUBLES, TrackerLostError, alone, few_tries, guard, insert, open_store
+from study.store import BUSY, TROUBLES, TrackerLostError, few_tries, guard, insert, open_store
 from study.view import NOTE, about, welcome
 
 # isort: split
@@ -199,7 +200,7 @@ class Tracker:
         key = content_key("sweep run", plan, (), PLAN_VERSION)
         name = f"{grid.name} ({profile})"
         facts = {name: value for name, value in provenance.items() if name != "diff"}
-        with self._guard(), alone(self._store.lock):
+        with self._guard(), alone(self._store.lock) if self._store.lock else nullcontext():
             sweeps = self._search("tags.kind = 'sweep'")
             latest = max((_opened(run) for run in sweeps), default=0)
             tags = {
