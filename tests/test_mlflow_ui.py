@@ -158,12 +158,8 @@ def test_each_cell_has_its_model(server, experiment, cells):
 
 def test_a_model_comes_back_from_the_server(server, cells, monkeypatch):
     monkeypatch.setenv("MLFLOW_ALLOW_PICKLE_DESERIALIZATION", "false")
-    before = mlflow.get_tracking_uri()
-    mlflow.set_tracking_uri(server.uri)
-    try:
-        driver = mlflow.pytorch.load_model(f"runs:/{cells['full 100% e0']['info']['run_id']}/driver")
-    finally:
-        mlflow.set_tracking_uri(before)
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", server.uri)
+    driver = mlflow.pytorch.load_model(f"runs:/{cells['full 100% e0']['info']['run_id']}/driver")
     answer = driver(torch.zeros(5, 3, 64, 64))
     assert torch.equal(answer["steering"], torch.zeros(SEEDS, 5))  # so the drawn policies say
     assert answer["acceleration"].shape == (SEEDS, 5, 3)
