@@ -9,12 +9,16 @@ from study.claims import MINUS
 
 Numbers = Mapping[str, Any]
 NOTHING = "\N{EM DASH}"
+SHARE_WORDS = (
+    "Ceiling: policies that are given the true state in the place of a latent. Share of gain: a score's part of the "
+    "way from the commonest class to there (acceleration only, since the state holds no route)."
+)
 LOSS = f"10<sup>{MINUS}3</sup>"
 UNIT_WORDS = {"points": " points", "loss": f" · {LOSS}", "epochs": "", "ratio": ""}
 
 
 def written(made: Numbers) -> str:
-    """The Markdown of a report.json: verdicts, scores, contrasts, convergence, spread, cost, provenance."""
+    """The Markdown of a report.json: verdicts, scores, contrasts, convergence, confounds, spread, cost, provenance."""
     parts = [
         f"## {plain(made['sweep']['title'])}",
         _lead(made),
@@ -22,6 +26,7 @@ def written(made: Numbers) -> str:
         _scores(made),
         _contrasts(made),
         _convergence(made),
+        _confounds(made),
         _components(made),
         _cost(made),
         _provenance(made),
@@ -131,34 +136,50 @@ def _verdicts(made: Numbers) -> str:
 
 
 def _scores(made: Numbers) -> str:
-    floor = made["floor"]
+    if not made["scores"]:
+        return "No cell is finished."
+    floor, ceiling = made["floor"], made["ceiling"]
     body = []
     for row in made["scores"]:
-        accuracy, steering = row["accuracy"], row["steering"]
+        steering = row["steering"]
         body.append(
             [
                 plain(row["cell"]),
-                str(row["n"]),
-                fixed(accuracy["mean"], 1, 100),
-                fixed(accuracy["sd"], 2, 100),
-                between(*(fixed(accuracy[end], 2, 100) for end in ("low", "high"))),
-                fixed(accuracy["iqm"], 1, 100),
+                *_accuracy(row["accuracy"]),
+                *([fixed(row["share"], 0, 100)] if ceiling else []),
                 fixed(row["balanced"]["mean"], 1, 100) if "balanced" in row else NOTHING,
                 fixed(row["macro_f1"], 3),
                 fixed(steering["mean"], 3, 1e3),
                 between(*(fixed(steering[end], 3, 1e3) for end in ("low", "high"))),
             ]
         )
-    header = ["Cell", "n", "accuracy [%]", "sd", "95 %", "IQM", "balanced", "macro-F1", f"steering [{LOSS}]", "95 %"]
-    table = rows(header, body)
-    if not table:
-        return "No cell is finished."
+    if ceiling:
+        body.append(["*ceiling (true state)*", *_accuracy(ceiling), fixed(1, 0, 100), *[NOTHING] * 4])
     kinds = "; ".join(dict.fromkeys(row["accuracy"]["kind"] for row in made["scores"]))
-    return (
+    text = (
         f"Final scores on test drives, mean of the last five epochs. Interval: {kinds}. Always saying the commonest "
         f"class gives {fixed(floor['accuracy'], 1, 100)} %, the best constant command a steering loss of "
-        f"{fixed(floor['steering'], 3, 1e3)}.\n\n{table}"
+        f"{fixed(floor['steering'], 3, 1e3)}."
     )
+    if ceiling:
+        text += f" {SHARE_WORDS}"
+    header = [
+        *("Cell", "n", "accuracy [%]", "sd", "95 %", "IQM"),
+        *(["share of gain [%]"] if ceiling else []),
+        *("balanced", "macro-F1", f"steering [{LOSS}]", "95 %"),
+    ]
+    return f"{text}\n\n{rows(header, body)}"
+
+
+def _accuracy(spread: Numbers) -> list[str]:
+    """n, mean, standard deviation, interval and interquartile mean."""
+    return [
+        str(spread["n"]),
+        fixed(spread["mean"], 1, 100),
+        fixed(spread["sd"], 2, 100),
+        between(*(fixed(spread[end], 2, 100) for end in ("low", "high"))),
+        fixed(spread["iqm"], 1, 100),
+    ]
 
 
 def _contrasts(made: Numbers) -> str:
@@ -206,6 +227,42 @@ def _convergence(made: Numbers) -> str:
         f"Epochs to reach the final accuracy of {own['baseline']}, {fixed(listed[0]['target'], 1, 100)} %: of the mean "
         "curve; by seed with a trailing mean that stays (Kaplan-Meier); share of the seeds that do. Area: mean "
         f"accuracy over all {own['policy_epochs']} epochs.\n\n{table}"
+    )
+
+
+def _confounds(made: Numbers) -> str:
+    seen = [row for row in made["confounds"] if row["contrasts"]]
+    pairs = [(row, contrast) for row in seen for contrast in row["contrasts"]]
+    body = []
+    for row, contrast in pairs:
+        own = [
+            (by_unit(one["value"], "points"), between(*(by_unit(one[end], "points") for end in ("low", "high"))))
+            for one in (contrast["here"], contrast["there"], contrast["change"])
+        ]
+        body.append(
+            [
+                code(row["setting"]),
+                plain(row["here"]),
+                plain(row["there"]),
+                plain(contrast["name"]),
+                f"{contrast['here']['n']}, {contrast['there']['n']}",
+                *(cell for found in own for cell in found),
+                contrast["state"],
+            ]
+        )
+    header = ["Setting", "here", "there", "Contrast", "n", "points here", "95 %", "points there", "95 %"]
+    table = rows([*header, "change", "95 %", ""], body, left=4)
+    kinds, changes = (
+        "; ".join(dict.fromkeys(contrast[name]["kind"] for _, contrast in pairs)) for name in ("here", "change")
+    )
+    others = ", ".join(
+        f"{code(row['setting'])} in {code(row['sweep'])} (floor {fixed(row['floor'], 1, 100)} %)" for row in seen
+    )
+    return table and (
+        "Confounds: differences in final accuracy under both values of a setting, paired by seed, all else the same. "
+        f"There: {others}; the floor here is {fixed(made['floor']['accuracy'], 1, 100)} %. Interval: {kinds}; of the "
+        f"change: {changes}. Moved: the change's interval, widened by the allowance for other encoders where a cell "
+        f"has one, excludes 0.\n\n{table}"
     )
 
 

@@ -79,13 +79,17 @@ def _write(path: Path, content: bytes) -> None:
 
 def publish(tracker: Tracker, name: str, profile: str | None, folder: Path) -> Path:
     """Build the report from the tracker alone, and add it to the sweep's run. Returns the PDF's path."""
-    record = tracker.read_sweep(name, profile)
-    record = replace(record, variants=tracker.read_variants(record))
-    pdf = build_report(record, folder)
+    pdf = build_report(_whole(tracker, name, profile), folder)
     own, sweep_run = folder / name, tracker.sweep_run(name, profile)
     tracker.log_files(sweep_run, [pdf, own / "report.json", own / "curves.parquet"], "report")
     tracker.log_files(sweep_run, sorted((own / "figures").iterdir()), "figures")
     return pdf
+
+
+def _whole(tracker: Tracker, name: str, profile: str | None) -> SweepRecord:
+    """A sweep, and those that vary one of its confounds."""
+    record = tracker.read_sweep(name, profile)
+    return replace(record, variants=tracker.read_variants(record))
 
 
 def parser() -> Parser:
@@ -131,7 +135,7 @@ def main(args: Sequence[str]) -> int:
         from study.markdown import written  # noqa: PLC0415
         from study.summary import numbers  # noqa: PLC0415
 
-        print(written(numbers(tracker.read_sweep(name, options.profile))), end="")
+        print(written(numbers(_whole(tracker, name, options.profile))), end="")
     else:
         print(publish(tracker, name, options.profile, options.out))
     return 0

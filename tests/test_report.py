@@ -187,7 +187,7 @@ def test_publish_builds_from_the_tracker_alone_and_logs_what_it_made(tracker, co
     assert {"report/pair.pdf", "report/report.json", "figures/test_compare_heads.svg"} <= logged
 
 
-def test_a_sweep_that_varies_one_setting_is_found_and_takes_nobodys_place(tracker, committed):
+def test_a_sweep_that_varies_one_setting_is_found_and_takes_nobodys_place(tracker, committed, capsys):
     record = committed[0]
     settings = record.settings.model_copy(
         update={"frames": record.settings.frames.model_copy(update={"split": "frame"})}
@@ -205,6 +205,8 @@ def test_a_sweep_that_varies_one_setting_is_found_and_takes_nobodys_place(tracke
     back = tracker.read_variants(tracker.read_sweep("pair-split"))
     assert {name: one.grid.name for name, one in back.items()} == {"frames.split": "pair"}
     assert tracker.read_sweep("pair").settings == record.settings
+    assert report.main(["pair", "--format", "md", "--tracking", tracker.uri]) == 0
+    assert "| `frames.split` | episode | frame | full" in capsys.readouterr().out
 
 
 def test_compare_takes_files_folders_and_sweeps_in_mlflow(tracker, committed, tmp_path, capsys):
