@@ -12,7 +12,6 @@ import ctypes
 import hashlib
 import io
 import itertools
-import logging
 import math
 import os
 import pickle
@@ -33,7 +32,6 @@ import lightning
 import numpy as np
 import pandas as pd
 import torch
-from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
@@ -53,6 +51,7 @@ from study.config import (
     one_of,
 )
 from study.cost import size
+from study.fitting import trainer
 from study.frames import Frames, epoch_order
 from study.result import Arrays, TrainingDivergedError
 
@@ -842,46 +841,18 @@ def _fit(module: MultiHeadAutoencoder, data: _Data, course: _Course, device: tor
         module.to(memory_format=torch.channels_last)
         if (data.plan.epochs - data.state.epoch) * data.plan.steps >= FUSED_STEPS:
             module.fuse()
-    with _quiet():
-        trainer = lightning.Trainer(
-            accelerator="gpu" if device.type == "cuda" else "cpu",
-            devices=1 if device.index is None else [device.index],
-            precision="bf16-mixed" if precision == "bf16" else "32-true",
-            max_epochs=data.plan.epochs - data.state.epoch,
-            callbacks=[course],
-            plugins=[LightningEnvironment()],  # one process, also inside a Slurm job
-            logger=False,
-            enable_checkpointing=False,
-            enable_progress_bar=False,
-            enable_model_summary=False,
-            num_sanity_val_steps=0,
-            benchmark=device.type == "cuda",  # sizes of batches hardly change: let cuDNN try which kernel is fastest
-            reload_dataloaders_every_n_epochs=1,
-        )
-        try:
-            trainer.fit(module, datamodule=data)
-        except torch.OutOfMemoryError as error:
-            raise BadInputError(
-                f"{device} has too little memory for batch {data.plan.batch} ({error}); lower --encoder.batch"
-            ) from error
-        except SystemExit as error:
-            if isinstance(error.__context__, KeyboardInterrupt):  # Lightning makes Ctrl-C an exit with code 1
-                raise KeyboardInterrupt from None
-            raise
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Lightning says nothing about devices, workers and its own products."""
-    logger = logging.getLogger("lightning.pytorch")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", module="lightning.*")
-            yield
-    finally:
-        logger.setLevel(level)
+    with trainer(
+        device,
+        data.plan.epochs - data.state.epoch,
+        f"batch {data.plan.batch}",
+        "lower --encoder.batch",
+        precision="bf16-mixed" if precision == "bf16" else "32-true",
+        callbacks=[course],
+        num_sanity_val_steps=0,
+        benchmark=device.type == "cuda",  # sizes of batches hardly change: let cuDNN try which kernel is fastest
+        reload_dataloaders_every_n_epochs=1,
+    ) as lightning_trainer:
+        lightning_trainer.fit(module, datamodule=data)
 
 
 def _keep_memory() -> None:

@@ -15,13 +15,11 @@ from __future__ import annotations
 
 import functools
 import itertools
-import logging
 import math
 import multiprocessing
 import threading
 import time
 import traceback
-import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -34,7 +32,6 @@ import lightning
 import numpy as np
 import pandas as pd
 import torch
-from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
@@ -49,6 +46,7 @@ from study.config import (
     BadInputError,
     PolicySettings,
 )
+from study.fitting import trainer
 from study.provenance import cores
 from study.result import CURVE_COLUMNS, TrainingDivergedError
 
@@ -747,40 +745,10 @@ def _points(seeds: Sequence[int], epoch: int, values: dict[str, NDArray[Any]]) -
 
 
 def _fit(ensemble: PolicyEnsemble, settings: PolicySettings, steps: int, device: str) -> None:
-    place = torch.device(device)
-    with _quiet():
-        trainer = lightning.Trainer(
-            accelerator="gpu" if place.type == "cuda" else "cpu",
-            devices=1 if place.index is None else [place.index],
-            max_epochs=settings.epochs,
-            plugins=[LightningEnvironment()],  # one process, also inside a Slurm job
-            logger=False,
-            enable_checkpointing=False,
-            enable_progress_bar=False,
-            enable_model_summary=False,
-        )
-        try:
-            trainer.fit(ensemble, train_dataloaders=range(steps))
-        except torch.OutOfMemoryError as error:
-            raise BadInputError(
-                f"{device} has too little memory for {len(ensemble.seeds)} policies at batch {settings.batch} "
-                f"({error}); lower --policy.batch or --policy_seeds, or end what else runs there"
-            ) from error
-        except SystemExit as error:
-            if isinstance(error.__context__, KeyboardInterrupt):  # Lightning makes Ctrl-C an exit with code 1
-                raise KeyboardInterrupt from None
-            raise
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Lightning says nothing about devices, loaders and its own products."""
-    logger = logging.getLogger("lightning.pytorch")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", module="lightning.*")
-            yield
-    finally:
-        logger.setLevel(level)
+    with trainer(
+        torch.device(device),
+        settings.epochs,
+        f"{len(ensemble.seeds)} policies at batch {settings.batch}",
+        "lower --policy.batch or --policy_seeds, or end what else runs there",
+    ) as lightning_trainer:
+        lightning_trainer.fit(ensemble, train_dataloaders=range(steps))
