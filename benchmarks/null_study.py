@@ -42,7 +42,7 @@ def main() -> None:
     point, table = (options.heads, max(record.grid.fractions)), record.table()
     accuracy, steering = (stats.panel(table, metric)[point] for metric in (stats.ACCURACY, stats.STEERING))
     seeds = accuracy.index.get_level_values("encoder_seed").unique()
-    floor, grid = claims.steering_floor(record, point), load_grid("heads")
+    floor, grid = claims.steering_floor(record, point), load_grid("heads", profile=record.profile)
     ways = list(itertools.permutations(seeds, len(HEAD_SETS)))
     outcomes: collections.Counter[tuple[str, str]] = collections.Counter()
     for way in ways:

@@ -191,20 +191,22 @@ Fraction = Annotated[float, Field(gt=0, le=1)]
 class Rules(Settings):
     """When a claim counts as reproduced, decided before the run (PAPER.md section 3; used by `study.claims`).
 
+    A sweep file gives each rule a number, or one for each profile: `{smoke: 0.1, laptop: 0.015}`; a profile that is not
+    named takes the largest.
+
     Three of them stand for what a study of one encoder a cell cannot see; a run of several (`heads-encoders`) checks
     them. With s the sd over encoders of one head set (the report's variance components, pooled over head sets), two
     encoders differ by sqrt(2) s, and the largest of a claim's three contrasts by up to 3.4 s at 0.05 (of one: 2.8 s).
     So `encoder_allowance` should be at least 3.4 s of final accuracy, 3.4 s of final steering loss should be well below
     `steering_margin`, and `spread_factor` at least exp(3.4 s) with s that of the log of the variance over P policies,
     whose square is smaller than what is found by 2 / (P - 1), the part of chance: this needs P = 10 or more.
-    Found with 14 encoders at half the data of `laptop`: s = 0.27 points, so 0.9 are needed and 1.0 are allowed;
-    steering 0.05e-3 against a margin of 0.24e-3; their 3 policies each cannot tell the last.
+    What was found is in benchmarks/README.md.
     """
 
     alpha: Annotated[float, Field(gt=0, lt=0.5)] = Field(0.05, description="error rate of a claim's contrasts together")
     accuracy_margin: NotNegative = Field(0.005, description="smallest difference in accuracy that matters")
     encoder_allowance: NotNegative = Field(
-        0.01,
+        0.015,
         description="what two encoders may differ in accuracy by their seeds alone; added to both ends of an interval "
         "when there is one encoder for each cell",
     )
@@ -421,12 +423,25 @@ def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
     return merged
 
 
-def load_grid(name: str, overrides: dict[str, Any] | None = None, folder: Path = SWEEPS) -> Grid:
-    """The sweep of that name. Raises BadInputError for an unknown sweep or setting."""
+def load_grid(
+    name: str, overrides: dict[str, Any] | None = None, folder: Path = SWEEPS, profile: str = "laptop"
+) -> Grid:
+    """The sweep of that name, with that profile's rules. Raises BadInputError for an unknown sweep or setting."""
     files = named_files(folder)
     if name not in files:
         raise one_of("sweep", name, files or [f"nothing: there are no sweep files in {folder.absolute()}"])
-    return validated(Grid, merge(read_yaml(files[name]), overrides or {}) | {"name": name}, f"sweep {name}")
+    content = merge(read_yaml(files[name]), overrides or {}) | {"name": name}
+    if isinstance(content.get("rules"), dict):
+        content["rules"] = {rule: _of_profile(value, profile) for rule, value in content["rules"].items()}
+    return validated(Grid, content, f"sweep {name}")
+
+
+def _of_profile(value: object, profile: str) -> object:
+    """A rule's number for a profile; what cannot be chosen from stays, for the check to name it."""
+    if not isinstance(value, dict):
+        return value
+    numbers = [each for each in value.values() if isinstance(each, int | float)]
+    return value.get(profile, max(numbers)) if len(numbers) == len(value) > 0 else value
 
 
 def load_profile(name: str, overrides: dict[str, Any] | None = None, folder: Path = SWEEPS) -> StudySettings:

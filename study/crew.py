@@ -84,7 +84,8 @@ def work(plan: Plan, options: argparse.Namespace, tracker: Tracker, *, lead: boo
         data = json.loads(manifest.read_text(encoding="utf-8")) if manifest.is_file() else {}
         if plan.imported:
             data["writers"] = plan.imported.writers  # a report must not call these drives our town's
-        opened = (plan.grid, plan.profile, plan.settings, plan.cells, data, provenance())
+        origin = provenance() | {"command": plan.command}
+        opened = (plan.grid, plan.profile, plan.settings, plan.cells, data, origin)
         sweep_run = tracker.open_sweep(*opened, join=not lead)
         jobs = {
             key: CellJob(

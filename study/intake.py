@@ -44,7 +44,8 @@ def take_in(plan: Plan, folder: Path, keys: Sequence[str], tracker: Tracker) -> 
 
     data = _manifest(plan, folder)
     done = tracker.finished(list(plan.cells))
-    sweep_run = tracker.open_sweep(plan.grid, plan.profile, plan.settings, plan.cells, data, provenance())
+    origin = provenance() | {"command": plan.command}
+    sweep_run = tracker.open_sweep(plan.grid, plan.profile, plan.settings, plan.cells, data, origin)
     status: Literal["FINISHED", "KILLED"] = "KILLED"
     try:
         for key in keys:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import json
 import os
+import shlex
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -38,12 +41,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Plan:
-    """What a sweep file, a profile and the command line come to. `cells`: key -> cell, in the order of the grid."""
+    """What a sweep file, a profile and the command line come to.
+
+    `cells`: key -> cell, in the order of the grid; `command`: runs it again, wherever the imported drives lie there.
+    """
 
     grid: Grid
     profile: str
     settings: StudySettings
     cells: dict[str, Cell]
+    command: str
     imported: Imported | None = None
 
     @property
@@ -77,14 +84,26 @@ def make_plan(name: str, profile: str, study: dict[str, Any], grid: dict[str, An
 
     Raises BadInputError.
     """
-    loaded = load_grid(name, grid)
+    loaded = load_grid(name, grid, profile=profile)
     settings = load_profile(profile, merge(loaded.settings, study))
     imported = open_import(data) if data else None
     if imported:
         imported.assign(settings.frames)  # too few drives are told now
     frames = frames_key(settings, imported.key if imported else None)
     cells = {cell_key(settings, cell, loaded.policy_seeds, frames): cell for cell in loaded.cells()}
-    return Plan(loaded, profile, settings, cells, imported)
+    words = ["python", "-m", "study.sweep", name, "--profile", profile, *_given(grid, study)]
+    return Plan(loaded, profile, settings, cells, shlex.join([*words, *["--data", "FOLDER"] * bool(data)]), imported)
+
+
+def _given(grid: dict[str, Any], study: dict[str, Any]) -> Iterator[str]:
+    """Overrides as options."""
+    settings = {f"{group}.{name}": value for group, part in study.items() for name, value in part.items()}
+    for name, value in (grid | settings).items():
+        yield f"--{name}"
+        if isinstance(value, list):
+            yield f"[{','.join(map(str, value))}]"
+        else:
+            yield json.dumps(value) if isinstance(value, dict) else str(value)
 
 
 def add_plan_options(parser: Parser) -> None:

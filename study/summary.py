@@ -355,5 +355,6 @@ def _provenance(record: SweepRecord) -> Numbers:
         "diff_lines": len(str(own.get("diff") or "").splitlines()),
         "packages": {name: packages[name] for name in SHOWN_PACKAGES if name in packages},
         "cell_commits": sorted(commits),
+        "command": own.get("command", f"python -m study.sweep {record.grid.name} --profile {record.profile}"),
         "keys": {cell.label: key for key, cell in record.planned.items()},
     }

@@ -218,7 +218,7 @@ class Tracker:
                     return run_id
             else:
                 identity = {"kind": "sweep", "sweep": grid.name, "profile": profile, "plan_key": key, NOTE: grid.title}
-                identity["mlflow.source.name"] = f"python -m study.sweep {grid.name} --profile {profile}"
+                identity["mlflow.source.name"] = _short(str(provenance.get("command", "python -m study.sweep")))
                 created = self._create(name, identity)
                 run_id = str(self._search(f"tags.plan_key = '{key}'")[0].info.run_id)
                 if created != run_id:  # a server has no lock: of two parents started at once, both take the first

@@ -30,7 +30,7 @@ class World:
     """What is true of the simulated study: accuracies and time constants by head set, noise by level."""
 
     accuracy: dict[str, float] = field(
-        default_factory=lambda: {"rec": 0.835, "rec+pred": 0.847, "rec+plan": 0.862, "full": 0.876}
+        default_factory=lambda: {"rec": 0.815, "rec+pred": 0.838, "rec+plan": 0.862, "full": 0.886}
     )
     time: dict[str, float] = field(
         default_factory=lambda: {"rec": 28.0, "rec+pred": 20.0, "rec+plan": 12.0, "full": 9.0}

@@ -108,7 +108,7 @@ def test_comparisons_are_corrected_for_planned_contrasts_that_are_not_there_yet(
 
 FREE = Rules(encoder_allowance=0.0, spread_factor=1.0)  # nothing but the intervals' own levels
 FIVE = HEADS_GRID.model_copy(update={"encoder_seeds": 5, "policy_seeds": 3})
-OTHER_ENCODERS = Null(encoder=0.003, encoder_steering=0.07, spread=0.1)  # as five encoders each of the laptop profile
+OTHER_ENCODERS = Null(encoder=0.004, encoder_steering=0.07, spread=0.1)  # as five encoders each of the laptop profile
 
 
 def claims_an_effect(verdict):

@@ -149,6 +149,25 @@ def test_wrong_settings_are_explained(overrides, words):
     assert all(word in str(caught.value) for word in words)
 
 
+def test_a_rule_is_one_number_or_one_for_each_profile(tmp_path):
+    file = tmp_path / "own.yaml"
+    file.write_text("title: T\nheads: [rec]\nrules: {alpha: 0.1, encoder_allowance: {smoke: 0.2, laptop: 0.02}}\n")
+    found = {name: load_grid("own", folder=tmp_path, profile=name).rules for name in ("smoke", "laptop", "mine")}
+    assert {name: rules.encoder_allowance for name, rules in found.items()} == {
+        "smoke": 0.2,
+        "laptop": 0.02,
+        "mine": 0.2,  # not named: the largest
+    }
+    assert {rules.alpha for rules in found.values()} == {0.1}
+
+
+@pytest.mark.parametrize("allowance", ["{}", "{smoke: much}", "{smoke: -1, laptop: -2}", "many"])
+def test_a_wrong_rule_is_explained(tmp_path, allowance):
+    (tmp_path / "own.yaml").write_text(f"title: T\nheads: [rec]\nrules: {{encoder_allowance: {allowance}}}\n")
+    with pytest.raises(BadInputError, match=r"rules\.encoder_allowance"):
+        load_grid("own", folder=tmp_path)
+
+
 def test_unknown_names_list_the_known_ones():
     with pytest.raises(BadInputError, match="choose from datasize, datasize-budget-steps"):
         load_grid("head")

@@ -1,9 +1,11 @@
 """What a sweep comes to."""
 
+import shlex
+
 import pytest
 
 from study.config import BadInputError
-from study.plan import thread_hint
+from study.plan import given_plan, thread_hint
 from study.provenance import cores
 from study.sweep import main, parser
 
@@ -23,3 +25,13 @@ def test_too_many_threads_are_told_with_what_to_do():
 def test_a_cell_needs_a_thread():
     with pytest.raises(BadInputError, match="--threads is 0"):
         main(["heads", "--threads", "0", "--dry-run"])
+
+
+def test_a_plans_command_makes_the_same_plan():
+    words = ["heads", "--profile", "smoke", "--heads", "[rec,rec+plan]", "--ceiling", "false", "--encoder.epochs", "3"]
+    words += ["--encoder.head_weights", "{plan: 5}", "--town.block", "[60, 90]"]
+    plan = given_plan(parser().parse(words))
+    program, again = shlex.split(plan.command)[:3], shlex.split(plan.command)[3:]
+    assert program == ["python", "-m", "study.sweep"]
+    assert given_plan(parser().parse(again)) == plan
+    assert plan != given_plan(parser().parse(words[:3]))

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import sqlite3
 import subprocess
@@ -127,3 +128,16 @@ def test_a_result_tells_what_made_it(folder):
     assert told["threads"] == 1
     assert told["provenance"]["determinism"].keys() >= {"deterministic_algorithms", "cudnn_benchmark", "matmul_tf32"}
     assert told["provenance"]["seeds"]["policies"] == [0, 1, 2]
+
+
+def test_encoders_that_differ_by_their_seed_alone_show_no_effect(folder, tmp_path):
+    """The real null study: four encoders of rec pose as the four head sets, in each of the 24 orders."""
+    take(folder, tmp_path)
+    words = ("heads", "--profile", "smoke", "--heads", "[rec]", "--encoder_seeds", "4", *LESS, "--no-report")
+    done = sweep(tmp_path, *words)
+    assert done.returncode == 0, done.stderr
+    words = [sys.executable, ROOT / "benchmarks/null_study.py", "heads", "--profile", "smoke"]
+    told = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=True, env=environment()).stdout
+    outcomes = set(re.findall(r"^(H\d) ([a-z ]+): \d+$", told, re.MULTILINE))
+    assert {claim for claim, _ in outcomes} == {"H1", "H2", "H3", "H4", "H5"}
+    assert {claim for claim, outcome in outcomes if outcome == "reproduced"} <= {"H1"}  # which says: no effect
