@@ -2,7 +2,7 @@
 
 import signal
 
-pytest_plugins = ("servers",)
+pytest_plugins = ("servers", "stores")
 
 # Tests send SIGINT to themselves and to programs that they start. A shell that runs the suite in the background has it
 # ignored, and every child would inherit that.

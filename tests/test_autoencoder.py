@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import itertools
 import os
 import signal
@@ -47,6 +46,7 @@ from study.config import (
 )
 from study.frames import Frames, build_frames, open_frames, unpack_masks
 from study.result import TrainingDivergedError
+from waiting import questions
 
 FRAMES = FramesSettings(encoder=160, policy=40, spacing=0.3, balance="none")
 SETTINGS = EncoderSettings(epochs=2, batch=32, precision="fp32")
@@ -403,20 +403,7 @@ def test_what_cannot_be_compiled_trains_without_after_one_warning(
 
 
 def test_inside_an_epoch_nobody_waits_for_the_device(frames: Frames, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[str] = []
-
-    def watched(step: Any) -> Any:
-        @functools.wraps(step)  # Lightning looks at its arguments
-        def run(*arguments: Any) -> None:
-            with pytest.MonkeyPatch.context() as patch:
-                for name in ("item", "tolist", "cpu", "numpy", "nonzero", "__bool__", "__int__", "__float__"):
-                    patch.setattr(torch.Tensor, name, lambda *_, name=name, **__: asked.append(name))
-                step(*arguments)
-
-        return run
-
-    for step in ("training_step", "validation_step"):
-        monkeypatch.setattr(MultiHeadAutoencoder, step, watched(getattr(MultiHeadAutoencoder, step)))
+    asked = questions(monkeypatch, MultiHeadAutoencoder, "training_step", "validation_step")
     train(frames, "full", SETTINGS.model_copy(update={"beta": 0.5}))
     assert asked == []
 

@@ -6,37 +6,23 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from drives import write_drives
 from study.birdview import MASK_BYTES
 from study.card import _others, _twins, card_files, card_text, make_card, nearest_frames, thumbnails, write_card
-from study.config import BirdviewSettings, FramesSettings
+from study.config import BirdviewSettings
 from study.episode import read_episode
 from study.figures import data_card
-from study.frames import Frames, build_frames, open_frames
+from study.frames import Frames, open_frames
 
 VIEW = BirdviewSettings()
-
-
-@pytest.fixture(scope="module")
-def drives(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("drives")
-    return write_drives(folder / "a", 3) + write_drives(folder / "b", 3, first_seed=10)
-
-
-@pytest.fixture(scope="module")
-def folder(drives, tmp_path_factory):
-    made = tmp_path_factory.mktemp("frames") / "store"
-    build_frames(FramesSettings(encoder=60, policy=40), VIEW, drives[:3], drives[3:], made, 1)
-    return made
 
 
 def pictures(count, seed=0):
     return np.random.default_rng(seed).integers(0, 256, (count, 64, 64, 3)).astype(np.uint8)
 
 
-def test_the_traffic_is_that_of_the_drives(folder, drives):
-    episodes = [read_episode(path) for path in drives]
-    said = make_card(open_frames(folder), drives)["drives"]
+def test_the_traffic_is_that_of_the_drives(small_store, small_drives):
+    episodes = [read_episode(path) for path in small_drives]
+    said = make_card(open_frames(small_store), small_drives)["drives"]
     seconds = sum(episode.steps / 10 for episode in episodes)
     metres = sum(float(episode.speed[episode.present].sum()) / 10 for episode in episodes)
     assert said["used"] == said["here"] == said["seeds"] == 6
@@ -46,30 +32,34 @@ def test_the_traffic_is_that_of_the_drives(folder, drives):
     assert said["vehicle_km"] == pytest.approx(metres / 1000, abs=0.006)
 
 
-def test_the_same_store_gives_the_same_bytes(folder, drives):
-    files = write_card(open_frames(folder), drives, folder)
+def test_the_same_store_gives_the_same_bytes(small_store, small_drives):
+    files = write_card(open_frames(small_store), small_drives, small_store)
     first = [file.read_bytes() for file in files]
-    assert [file.read_bytes() for file in write_card(open_frames(folder), drives[::-1], folder)] == first
-    assert sorted(path.name for path in (folder / "card").iterdir()) == ["card.json", "card.png", "card.txt"]
-    assert not list(folder.glob(".card*"))
+    assert [
+        file.read_bytes() for file in write_card(open_frames(small_store), small_drives[::-1], small_store)
+    ] == first
+    assert sorted(path.name for path in (small_store / "card").iterdir()) == ["card.json", "card.png", "card.txt"]
+    assert not list(small_store.glob(".card*"))
 
 
-def test_a_card_that_is_there_is_not_made_again(folder, drives):
-    files = card_files(open_frames(folder), drives, folder)
+def test_a_card_that_is_there_is_not_made_again(small_store, small_drives):
+    files = card_files(open_frames(small_store), small_drives, small_store)
     before = [file.stat().st_mtime_ns for file in files]
-    assert [file.stat().st_mtime_ns for file in card_files(open_frames(folder), drives, folder)] == before
+    assert [
+        file.stat().st_mtime_ns for file in card_files(open_frames(small_store), small_drives, small_store)
+    ] == before
 
 
-def test_a_store_whose_drives_are_gone_still_has_a_card(folder, tmp_path):
-    store = open_frames(folder)
+def test_a_store_whose_drives_are_gone_still_has_a_card(small_store, tmp_path):
+    store = open_frames(small_store)
     card = make_card(store, [])
     assert card["drives"] == {"used": 6, "here": 0}
     assert "none of them here" in card_text(card)
     assert len(write_card(store, [], tmp_path)) == 3
 
 
-def test_the_text_names_every_share_and_how_many_were_counted(folder, drives):
-    card = make_card(open_frames(folder), drives)
+def test_the_text_names_every_share_and_how_many_were_counted(small_store, small_drives):
+    card = make_card(open_frames(small_store), small_drives)
     text = card_text(card)
     for words in ("standing", "light red", "command -1", "before selection", "other vehicles in view", "split: frame"):
         assert text.count(words) == 2  # once for each set
@@ -77,9 +67,9 @@ def test_the_text_names_every_share_and_how_many_were_counted(folder, drives):
     json.dumps(card, allow_nan=False)
 
 
-def test_agents_in_view_are_those_whose_centre_is_painted(drives):
+def test_agents_in_view_are_those_whose_centre_is_painted(small_drives):
     """Counted again by hand: turned into the ego's frame with complex numbers."""
-    episode = read_episode(drives[0])
+    episode = read_episode(small_drives[0])
     labels = pd.DataFrame({"step": [12, 40, 60], "agent": [100, 103, 107]})
     expected = []
     for step, agent in labels.itertuples(index=False):
@@ -87,7 +77,7 @@ def test_agents_in_view_are_those_whose_centre_is_painted(drives):
         ego = [item.id for item in episode.agents].index(agent)
         seen = (place - place[ego]) * np.exp(-1j * episode.heading[step, ego])
         expected.append(int(((np.abs(seen.imag) < 20) & (seen.real > -15) & (seen.real < 25)).sum()) - 1)
-    assert _others(labels, drives[0], VIEW.model_dump()) == expected
+    assert _others(labels, small_drives[0], VIEW.model_dump()) == expected
     assert max(expected) > 0
 
 
@@ -117,8 +107,8 @@ def test_a_split_by_frame_finds_the_twins_that_a_split_by_drive_keeps_apart():
     assert found["frame"]["test"] == found["episode"]["test"] == 80
 
 
-def test_frames_of_a_single_drive_are_split_by_frame_only(folder, drives):
-    card = make_card(open_frames(folder), drives)
+def test_frames_of_a_single_drive_are_split_by_frame_only(small_store, small_drives):
+    card = make_card(open_frames(small_store), small_drives)
     labels = pd.DataFrame({"episode": np.zeros(50, int)})
     found = _twins(Frames(pictures(50), np.zeros((50, 2, MASK_BYTES), np.uint8), labels), 0.2, 0)
     assert "episode" not in found

@@ -16,13 +16,11 @@ import pytest
 import torch
 
 from browser import Browser, program
-from drives import write_drives
 from servers import LOOPBACK, TrackingServer
 from simulated import HEADS_GRID, World, simulate
 from study.card import card_files
-from study.config import BirdviewSettings, FramesSettings
 from study.exported import export_driver
-from study.frames import build_frames, open_frames
+from study.frames import open_frames
 from study.tracking import Tracker
 
 pytestmark = pytest.mark.slow
@@ -42,17 +40,15 @@ def server(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def sweep(server, tmp_path_factory):
+def sweep(server, small_store, small_drives, tmp_path_factory):
     """A finished sweep of the four head sets: drawn curves, a real report, the card of real frames, models."""
     made = tmp_path_factory.mktemp("sweep")
-    drives = write_drives(made / "drives", 4)
-    build_frames(FramesSettings(encoder=40, policy=20), BirdviewSettings(), drives[:2], drives[2:], made / "frames", 1)
     record = simulate(HEADS_GRID.model_copy(update={"policy_seeds": SEEDS, "ceiling": False}), World(epochs=EPOCHS))
     tracker = Tracker(server.uri)
     run_id = tracker.open_sweep(
         record.grid, record.profile, record.settings, record.planned, record.data, record.provenance
     )
-    tracker.log_files(run_id, card_files(open_frames(made / "frames"), drives, made / "frames"), "data")
+    tracker.log_files(run_id, card_files(open_frames(small_store), small_drives, small_store), "data")
     tracker.log_files(run_id, [REFERENCE / "report.pdf"], "report")
     tracker.log_files(run_id, [REFERENCE / "test_compare_heads.png"], "figures")
     network = export_driver(next(iter(record.results.values())), made / "network.pt2")  # drawn weights are all the same

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import itertools
 import multiprocessing
 import os
@@ -41,6 +40,7 @@ from study.policy import (
     train_policies,
 )
 from study.result import CURVE_COLUMNS, TrainingDivergedError
+from waiting import questions
 
 SETTINGS = PolicySettings(epochs=5, batch=64, lr=5e-3)
 TRAIN, TEST = 300, 120  # 300 is no multiple of 64: the last batch is short
@@ -182,17 +182,7 @@ def test_all_seeds_as_one_group_come_out_as_one_group_each(
 
 def test_inside_an_epoch_nobody_waits_for_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
     """The way of a GPU: no number leaves it before the epoch's end."""
-    asked: list[str] = []
-    step = policy.PolicyEnsemble.training_step
-
-    @functools.wraps(step)  # Lightning looks at its arguments
-    def watched(*arguments: Any) -> None:
-        with pytest.MonkeyPatch.context() as patch:
-            for name in ("item", "tolist", "cpu", "numpy", "nonzero", "__bool__", "__int__", "__float__"):
-                patch.setattr(torch.Tensor, name, lambda *_, name=name, **__: asked.append(name))
-            step(*arguments)
-
-    monkeypatch.setattr(policy.PolicyEnsemble, "training_step", watched)
+    asked = questions(monkeypatch, policy.PolicyEnsemble, "training_step")
     monkeypatch.setattr(policy, "_groups", lambda seeds, device: [slice(0, seeds)])
     train()
     assert asked == []

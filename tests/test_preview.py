@@ -6,44 +6,31 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from drives import crossing_drive, write_drives
+from drives import crossing_drive
 from study.birdview import Renderer
-from study.config import BadInputError, BirdviewSettings, FramesSettings
+from study.config import BadInputError, BirdviewSettings
 from study.episode import RED
-from study.frames import build_frames, open_frames, unpack_masks
+from study.frames import open_frames, unpack_masks
 from study.preview import LIGHTS, choose_ego, label_text, sample, write_film, write_preview
 
 VIEW = BirdviewSettings()
 
 
-@pytest.fixture(scope="module")
-def drives(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("drives")
-    return write_drives(folder / "a", 2) + write_drives(folder / "b", 2, first_seed=10)
-
-
-@pytest.fixture(scope="module")
-def folder(drives, tmp_path_factory):
-    made = tmp_path_factory.mktemp("frames") / "store"
-    build_frames(FramesSettings(encoder=40, policy=20), VIEW, drives[:2], drives[2:], made, 1)
-    return made
-
-
-def test_both_files_are_pictures_and_the_same_each_time(folder, drives):
-    files = write_preview(open_frames(folder), drives, folder)
+def test_both_files_are_pictures_and_the_same_each_time(small_store, small_drives):
+    files = write_preview(open_frames(small_store), small_drives, small_store)
     first = [file.read_bytes() for file in files]
-    assert [file.read_bytes() for file in write_preview(open_frames(folder), drives, folder)] == first
+    assert [file.read_bytes() for file in write_preview(open_frames(small_store), small_drives, small_store)] == first
     assert [Image.open(file).format for file in files] == ["PNG", "GIF"]
-    assert sorted(path.name for path in folder.iterdir() if path.name.startswith(".")) == []
+    assert sorted(path.name for path in small_store.iterdir() if path.name.startswith(".")) == []
 
 
-def test_a_store_whose_drives_are_gone_is_told(folder):
+def test_a_store_whose_drives_are_gone_is_told(small_store):
     with pytest.raises(BadInputError, match="build it again"):
-        write_preview(open_frames(folder), [], folder)
+        write_preview(open_frames(small_store), [], small_store)
 
 
-def test_the_sheet_shows_training_frames_with_their_masks_and_labels(folder):
-    frames = open_frames(folder).encoder
+def test_the_sheet_shows_training_frames_with_their_masks_and_labels(small_store):
+    frames = open_frames(small_store).encoder
     shown = sample(frames, 0, count=5)
     train = frames.indices("train")
     for text, pictures in shown:
@@ -53,8 +40,8 @@ def test_the_sheet_shows_training_frames_with_their_masks_and_labels(folder):
     assert len(shown) == 5
 
 
-def test_the_label_names_what_the_row_holds(folder):
-    frames = open_frames(folder).encoder
+def test_the_label_names_what_the_row_holds(small_store):
+    frames = open_frames(small_store).encoder
     labels = frames.labels.copy()
     labels.loc[0, ["acceleration", "steering", "speed", "light", "light_distance", "lead_gap"]] = 0, -0.1, 5, 2, 12, 8
     text = label_text(dataclasses.replace(frames, labels=labels), 0)

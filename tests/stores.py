@@ -1,0 +1,27 @@
+"""One small frame store and its drives, made once for all tests that only look at them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from drives import write_drives
+from study.config import BirdviewSettings, FramesSettings
+from study.frames import build_frames
+
+
+@pytest.fixture(scope="session")
+def small_drives(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Three drives for encoders, then three for policies."""
+    made = tmp_path_factory.mktemp("drives")
+    return write_drives(made / "a", 3) + write_drives(made / "b", 3, first_seed=10)
+
+
+@pytest.fixture(scope="session")
+def small_store(small_drives: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a frame store of those drives; cards and previews may be written there."""
+    made = tmp_path_factory.mktemp("frames") / "store"
+    settings = FramesSettings(encoder=60, policy=40)
+    build_frames(settings, BirdviewSettings(), small_drives[:3], small_drives[3:], made, 1)
+    return made
