@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from study.config import ACCELERATIONS, IMAGE
 from study.episode import episode_digest
-from study.figures import data_card, write_png
 from study.frames import Frames, FrameStore
 from study.selection import SETS
 
@@ -68,6 +67,8 @@ def make_card(store: FrameStore, drives: Sequence[Path]) -> dict[str, Any]:
 
 def write_card(store: FrameStore, drives: Sequence[Path], folder: Path) -> tuple[Path, ...]:
     """Make the card of the store in `folder` and write it there, whole or not at all; returns its files."""
+    from study.figures import data_card, write_png  # noqa: PLC0415 - matplotlib; a card that is there needs none
+
     card = make_card(store, drives)
     place = folder / "card"
     with tempfile.TemporaryDirectory(prefix=".card.", dir=folder) as name:

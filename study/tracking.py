@@ -29,7 +29,6 @@ import pandas as pd
 
 from study.command import alone
 from study.config import DEFAULT_TRACKING, BadInputError, Cell, Grid, StudySettings, content_key, masked
-from study.confounds import contrasts, varied
 from study.mlmodel import log_model
 from study.points import COMMIT, Point, bands, cell_points, facts_of, flatten, points, scores_of
 from study.result import ARRAYS, CellResult, SweepRecord
@@ -280,6 +279,8 @@ class Tracker:
 
     def read_variants(self, record: SweepRecord) -> dict[str, SweepRecord]:
         """Sweeps of the same profile that differ from this one in one confound alone; of each the latest."""
+        from study.confounds import contrasts, varied  # noqa: PLC0415 - scipy, which only reports need
+
         found: dict[str, SweepRecord] = {}
         with self._guard():
             sweeps = sorted(self._search("tags.kind = 'sweep'"), key=_opened, reverse=True)
