@@ -7,7 +7,7 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from study.config import BadInputError
 from study.plan import Plan
@@ -38,15 +38,18 @@ def planned_results(plan: Plan, folder: Path) -> list[str]:
 def take_in(plan: Plan, folder: Path, keys: Sequence[str], tracker: Tracker) -> list[str]:
     """Commit the results of those keys, unless their cells are finished. Returns the keys that are still missing.
 
+    Where other machines work on the sweep just now, it stays theirs: its run is closed only when nothing is missing.
     Raises BadInputError when the frames' manifest beside the results is not theirs.
     """
     from study.exported import export_driver  # noqa: PLC0415 - torch, which a refusal does not need
 
     data = _manifest(plan, folder)
     done = tracker.finished(list(plan.cells))
+    planned = (plan.grid, plan.profile, plan.settings, plan.cells)
+    goes_on = tracker.runs_elsewhere(*planned)
     origin = provenance() | {"command": plan.command}
-    sweep_run = tracker.open_sweep(plan.grid, plan.profile, plan.settings, plan.cells, data, origin)
-    status: Literal["FINISHED", "KILLED"] = "KILLED"
+    sweep_run = tracker.open_sweep(*planned, data, origin, join=goes_on)
+    missing = list(plan.cells)
     try:
         for key in keys:
             if key in done:
@@ -63,9 +66,9 @@ def take_in(plan: Plan, folder: Path, keys: Sequence[str], tracker: Tracker) -> 
                 raise
             _say(f"{plan.cells[key].label} ({key}): imported")
         missing = [key for key in plan.cells if key not in done]
-        status = "KILLED" if missing else "FINISHED"
     finally:
-        tracker.close_sweep(sweep_run, status)
+        if not (missing and goes_on):
+            tracker.close_sweep(sweep_run, "KILLED" if missing else "FINISHED")
     return missing
 
 

@@ -189,14 +189,7 @@ class Tracker:
         `data` is the frame store's manifest; it becomes an MLflow dataset whose digest is its `key`. Who only wants to
         `join` what another machine has opened leaves what is written there as it is.
         """
-        plan: dict[str, Any] = {
-            "format_version": PLAN_VERSION,
-            "grid": grid.model_dump(mode="json"),
-            "profile": profile,
-            "settings": settings.model_dump(mode="json"),
-            "planned": {key: cell.model_dump(mode="json") for key, cell in planned.items()},
-        }
-        key = content_key("sweep run", plan, (), PLAN_VERSION)
+        plan, key = _plan(grid, profile, settings, planned)
         name = f"{grid.name} ({profile})"
         facts = {name: value for name, value in provenance.items() if name != "diff"}
         with self._guard(), alone(self._store.lock) if self._store.lock else nullcontext():
@@ -238,6 +231,13 @@ class Tracker:
             if data:
                 insert(self.client.log_inputs, run_id, datasets=[_dataset(data)])
         return run_id
+
+    def runs_elsewhere(self, grid: Grid, profile: str, settings: StudySettings, planned: Mapping[str, Cell]) -> bool:
+        """Whether another machine has this plan's sweep run open now. In a database file, a kill has left it so."""
+        _, key = _plan(grid, profile, settings, planned)
+        with self._guard():
+            open_ = f"tags.plan_key = '{key}' and attributes.status = 'RUNNING'"
+            return self._store.database is None and bool(self._search(open_))
 
     def _reused(self, planned: Mapping[str, Cell], name: str) -> str:
         """Planned cells that another sweep has finished, in words."""
@@ -542,6 +542,18 @@ class Tracker:
 
 
 # --- plain values ---------------------------------------------------------------------------------------------------
+
+
+def _plan(grid: Grid, profile: str, settings: StudySettings, planned: Mapping[str, Cell]) -> tuple[dict[str, Any], str]:
+    """What a sweep run keeps of its plan, and its key."""
+    plan: dict[str, Any] = {
+        "format_version": PLAN_VERSION,
+        "grid": grid.model_dump(mode="json"),
+        "profile": profile,
+        "settings": settings.model_dump(mode="json"),
+        "planned": {key: cell.model_dump(mode="json") for key, cell in planned.items()},
+    }
+    return plan, content_key("sweep run", plan, (), PLAN_VERSION)
 
 
 def _short(text: str) -> str:
