@@ -67,7 +67,7 @@ def make_card(store: FrameStore, drives: Sequence[Path]) -> dict[str, Any]:
 
 def write_card(store: FrameStore, drives: Sequence[Path], folder: Path) -> tuple[Path, ...]:
     """Make the card of the store in `folder` and write it there, whole or not at all; returns its files."""
-    from study.figures import data_card, write_png  # noqa: PLC0415 - matplotlib; a card that is there needs none
+    from study.figures import data_card, write  # noqa: PLC0415 - matplotlib; a card that is there needs none
 
     card = make_card(store, drives)
     place = folder / "card"
@@ -76,7 +76,7 @@ def write_card(store: FrameStore, drives: Sequence[Path], folder: Path) -> tuple
         draft.mkdir()
         (draft / "card.json").write_text(json.dumps(card, indent=1, allow_nan=False) + "\n", encoding="utf-8")
         (draft / "card.txt").write_text(card_text(card), encoding="utf-8")
-        write_png(data_card(card), draft / "card.png")
+        write(data_card(card), draft / "card.png")
         if place.exists():
             shutil.rmtree(place)
         os.rename(draft, place)  # noqa: PTH104 - the one atomic step

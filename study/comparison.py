@@ -9,20 +9,35 @@ from __future__ import annotations
 import itertools
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from study import stats
 from study.claims import MINUS
-from study.config import BadInputError, Cell, Settings, validated
-from study.markdown import LOSS, NOTHING, between, code, fixed, found, plain, rows
+from study.config import HEAD_SETS, BadInputError, Cell, Settings, validated
+from study.markdown import LOSS, NOTHING, SHARE_WORDS, between, code, fixed, found, plain, rows
 from study.stats import Estimate
 from study.summary import FORMAT_VERSION
 
-MEASURES = (("accuracy [%]", "accuracy", 2, 100.0), (f"steering [{LOSS}]", "steering", 3, 1e3))
 Number = float | Literal["never"] | None
+
+
+class Measure(NamedTuple):
+    """A score: its name in a report.json, how tables print it, and the guess that makes its floor."""
+
+    name: str
+    title: str
+    digits: int
+    factor: float
+    guess: str
+
+
+MEASURES = (
+    Measure("accuracy", "accuracy [%]", 2, 100.0, "commonest class"),
+    Measure("steering", f"steering [{LOSS}]", 3, 1e3, "best constant command"),
+)
 
 
 class Part(Settings, extra="ignore", allow_inf_nan=False):
@@ -49,19 +64,22 @@ class SpreadPart(Part):
     """A score: its mean, its interval's kind, and the value of each sampling unit by seed."""
 
     mean: float
+    low: float | None
+    high: float | None
     n: int
     kind: str
     units: dict[int, float]
 
 
 class ScorePart(Part):
-    """Scores of a head set and fraction."""
+    """Scores of a head set and fraction; `share` of the possible gain, where the report has a ceiling."""
 
     cell: str
     heads: str
     fraction: float
     accuracy: SpreadPart
     steering: SpreadPart
+    share: float | None = None
 
 
 class EstimatePart(Part):
@@ -73,12 +91,27 @@ class EstimatePart(Part):
     n: int
 
 
+class DifferencePart(Part):
+    """A difference between scores, with its interval."""
+
+    value: float
+    low: float | None
+    high: float | None
+    kind: str
+
+    def turned(self) -> DifferencePart:
+        """The other way round."""
+        low, high = (None if end is None else -end for end in (self.high, self.low))
+        return self.model_copy(update={"value": -self.value, "low": low, "high": high})
+
+
 class ContrastPart(Part):
     """A difference between two cells of one sweep."""
 
     metric: str
     first: tuple[str, float]
     second: tuple[str, float]
+    difference: DifferencePart
     simultaneous: tuple[Number, Number]
 
 
@@ -143,6 +176,7 @@ class Report(Part):
 
     sweep: SweepPart
     floor: dict[str, Number]
+    ceiling: SpreadPart | None = None
     scores: tuple[ScorePart, ...]
     comparisons: tuple[ContrastPart, ...]
     convergence: tuple[ConvergencePart, ...]
@@ -156,6 +190,14 @@ class Report(Part):
     def points(self) -> list[stats.Point]:
         """Head sets and fractions that have a score."""
         return [(row.heads, row.fraction) for row in self.scores]
+
+    def above_baseline(self, point: stats.Point) -> DifferencePart | None:
+        """The difference in accuracy of a head set to the baseline at the same fraction."""
+        base = (self.sweep.baseline, point[1])
+        for row in self.comparisons:
+            if row.metric == stats.ACCURACY and point != base and {row.first, row.second} == {point, base}:
+                return row.difference if row.first == point else row.difference.turned()
+        return None
 
 
 def checked(content: object, source: str) -> Report:
@@ -185,18 +227,18 @@ def read_report(path: Path) -> Report:
 # --- the text -------------------------------------------------------------------------------------------------------
 
 
-def compare(first: Report, second: Report, names: tuple[str, str]) -> str:
-    """Two reports side by side as Markdown; `names` say where each comes from."""
+def compare(first: Report, second: Report, names: tuple[str, str], picture: str = "") -> str:
+    """Two reports side by side as Markdown; `names` say where each comes from, `picture` is shown with the scores."""
     parts = [
         f"## {plain(first.sweep.title)}: two sweeps side by side",
         f"First: {code(names[0])}. Second: {code(names[1])}. Differences are second {MINUS} first.",
         "### What differs",
         _differing(first, second),
         "### Final scores",
+        picture,
         *_scores(first, second),
         "### Order of head sets by accuracy",
         _orders(first, second),
-        "### Convergence",
         _convergence(first, second),
         "### Verdicts",
         _verdicts(first, second),
@@ -245,37 +287,72 @@ def _facts(report: Report) -> Iterator[tuple[str, str]]:
 # --- scores ---------------------------------------------------------------------------------------------------------
 
 
+def labels(first: Report, second: Report) -> dict[stats.Point, str]:
+    """Head sets and fractions that either has a score of, most data first, with names that tell them apart."""
+    order = {heads: place for place, heads in enumerate(HEAD_SETS)}
+    points = sorted(
+        {*first.points, *second.points}, key=lambda point: (-point[1], order.get(point[0], len(order)), point[0])
+    )
+    several = len({fraction for _, fraction in points}) > 1
+    return {(heads, part): f"{heads} at {100 * part:g} %" if several else heads for heads, part in points}
+
+
 def _scores(first: Report, second: Report) -> Iterator[str]:
-    both = [point for point in first.points if point in second.points]
-    kinds, tables = [], []
-    for title, metric, digits, factor in MEASURES:
-        body = []
-        for point in both:
-            sides = [getattr(_score(report, point), metric) for report in (first, second)]
-            made = difference(sides[0], sides[1])
-            show = partial(fixed, digits=digits, factor=factor)
-            low, high = (None if math.isnan(end) else end for end in (made.low, made.high))
-            kinds.append(made.kind)
-            body.append(
-                [
-                    plain(_score(first, point).cell),
-                    *(f"{show(side.mean)} ({side.n})" for side in sides),
-                    show(made.value, sign=True),
-                    between(show(low, sign=True), show(high, sign=True)),
-                ]
-            )
-        tables.append(rows([title, "first (n)", "second (n)", "difference", "95 %"], body))
-    yield _about(first, second, kinds) if both else "No head set and fraction is finished in both."
-    told = [
-        f"{plain(_score(first, point).cell)} ({words})" for point in both if (words := _shared(first, second, point))
-    ]
+    names, ceilings = labels(first, second), (first.ceiling, second.ceiling)
+    both = [point for point in names if point in first.points and point in second.points]
+    kinds: list[str] = []
+    tables = [_measured(first, second, both, measure, kinds) for measure in MEASURES]
+    if not both:
+        yield "No head set and fraction is finished in both."
+    if kinds:
+        yield f"{_about(first, second, kinds)} {SHARE_WORDS}" if all(ceilings) else _about(first, second, kinds)
+    told = [f"{plain(names[point])} ({words})" for point in both if (words := _shared(first, second, point))]
     if told:
         yield f"Cells of the same key in both: {', '.join(told)}."
     yield from tables
     for name, one, other in (("first", first, second), ("second", second, first)):
-        alone = [plain(row.cell) for row in one.scores if (row.heads, row.fraction) not in other.points]
+        alone = [plain(names[point]) for point in names if point in one.points and point not in other.points]
         if alone:
             yield f"Only in the {name}: {', '.join(alone)}."
+
+
+def _measured(first: Report, second: Report, both: Sequence[stats.Point], measure: Measure, kinds: list[str]) -> str:
+    """The table of a measure, with its ceiling and floor; adds the kinds of its intervals to `kinds`."""
+    sides, names, show = (
+        (first, second),
+        labels(first, second),
+        partial(fixed, digits=measure.digits, factor=measure.factor),
+    )
+    ceilings = [report.ceiling for report in sides if measure.name == "accuracy"]
+    body, shares = [], []
+    for point in both:
+        scores = [_score(report, point) for report in sides]
+        shares.append([score.share for score in scores])
+        body.append([plain(names[point]), *_beside([getattr(score, measure.name) for score in scores], show, kinds)])
+    if any(ceilings):
+        shares.append([1.0, 1.0])
+        body.append(["*ceiling (true state)*", *_beside(ceilings, show, kinds)])
+    floors = [report.floor.get(measure.name) for report in sides]
+    if floors != [None, None]:
+        shares.append([0.0, 0.0])
+        body.append([f"*floor ({measure.guess})*", *map(show, floors), NOTHING, NOTHING])
+    header = [measure.title, "first (n)", "second (n)", "difference", "95 %"]
+    if ceilings and all(ceilings):
+        header += ["share of gain, first [%]", "share of gain, second [%]"]
+        body = [[*row, *(fixed(share, 0, 100) for share in own)] for row, own in zip(body, shares, strict=True)]
+    return rows(header, body)
+
+
+def _beside(sides: Sequence[SpreadPart | None], show: Callable[..., str], kinds: list[str]) -> list[str]:
+    """Two scores with n, and their difference with its interval, whose kind is added to `kinds`."""
+    cells = [f"{show(side.mean)} ({side.n})" if side else NOTHING for side in sides]
+    first, second = sides
+    if not first or not second:
+        return [*cells, NOTHING, NOTHING]
+    made = difference(first, second)
+    kinds.append(made.kind)
+    low, high = (None if math.isnan(end) else end for end in (made.low, made.high))
+    return [*cells, show(made.value, sign=True), between(show(low, sign=True), show(high, sign=True))]
 
 
 def difference(first: SpreadPart, second: SpreadPart) -> Estimate:
@@ -367,13 +444,13 @@ def _chain(order: Sequence[tuple[str, str]]) -> str:
 
 def _convergence(first: Report, second: Report) -> str:
     sides = [{(row.heads, row.fraction): row for row in report.convergence} for report in (first, second)]
-    body = []
+    body, names = [], labels(first, second)
     for point in sides[0]:
         if point in sides[1]:
             both = [side[point] for side in sides]
             body.append(
                 [
-                    plain(_score(first, point).cell),
+                    plain(names[point]),
                     *(
                         f"{fixed(row.mean_curve.value, 0)} "
                         f"({between(fixed(row.mean_curve.low, 0), fixed(row.mean_curve.high, 0))})"
@@ -386,8 +463,8 @@ def _convergence(first: Report, second: Report) -> str:
     header = ["Cell", "epochs, first", "epochs, second", "share, first", "share, second", "area, first", "area, second"]
     table = rows(header, body)
     return table and (
-        "Epochs until the mean curve reaches the baseline's final accuracy of its own sweep (95 %), share of the seeds "
-        f"that do [%], mean accuracy over all epochs [%].\n\n{table}"
+        "### Convergence\n\nEpochs until the mean curve reaches the baseline's final accuracy of its own sweep (95 %), "
+        f"share of the seeds that do [%], mean accuracy over all epochs [%].\n\n{table}"
     )
 
 

@@ -7,7 +7,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from study import claims, figures, stats
-from study.config import CEILING
+from study.comparison import Report, labels
+from study.config import CEILING, BadInputError
 from study.figures import Drawing
 from study.result import CellResult, SweepRecord
 from study.summary import Numbers
@@ -233,6 +234,58 @@ def _confounds(made: Numbers) -> list[Drawing]:
             )
         )
     return drawings
+
+
+def draw_sweeps(first: Report, second: Report, names: tuple[str, str]) -> Drawing:
+    """Final accuracy, and differences to the baseline, of two sweeps; `names` say where each comes from.
+
+    Raises BadInputError when neither has a finished cell.
+    """
+    sides, named = (first, second), labels(first, second)
+    if not named:
+        raise BadInputError(f"no cell is finished in {names[0]} or {names[1]}: nothing to draw, leave out --figure")
+    scores = [{(row.heads, row.fraction): row.accuracy for row in side.scores} for side in sides]
+    gains = [{point: gain for point in named if (gain := side.above_baseline(point))} for side in sides]
+    pairs, told = [], []
+    for point, label in named.items():
+        one, other = ((own.mean, own.low, own.high) if (own := side.get(point)) else None for side in scores)
+        up, more = ((gain.value, gain.low, gain.high) if (gain := side.get(point)) else None for side in gains)
+        pairs.append(figures.Pair(label, point[0], point[1], (one, other), (up, more)))
+        told.append(f"{label}: " + " and ".join(f"{100 * own[0]:.1f} %" if own else "none" for own in (one, other)))
+    bases = (first.sweep.baseline, second.sweep.baseline)
+    keys = (_key("first", first, names[0]), _key("second", second, names[1]))
+    kinds = dict.fromkeys(own.kind for side in scores for own in side.values())
+    above = ""
+    if any(gains):
+        kinds |= dict.fromkeys(gain.kind for side in gains for gain in side.values())
+        above = f", and (b) as difference to {' or '.join(dict.fromkeys(bases))} of the same sweep, paired by seed"
+    return Drawing(
+        "two_sweeps",
+        "comparison",
+        f"(a) Test acceleration accuracy, mean of the last {stats.LAST} epochs{above}. Filled: {keys[0]}. Hollow: "
+        f"{keys[1]}. Bar: 95 % interval ({'; '.join(kinds)}).",
+        f"Dot plot of two sweeps. Accuracy, first and second: {'; '.join(told)}.",
+        figures.two_sweeps(pairs, keys, bases, _ends(first, second)),
+    )
+
+
+def _key(word: str, report: Report, name: str, most: int = 60) -> str:
+    """Which sweep it is, with n; of a long name the end."""
+    shown = name if len(name) <= most else f"\N{HORIZONTAL ELLIPSIS}{name[1 - most :]}"
+    counts = " or ".join(map(str, sorted({row.accuracy.n for row in report.scores}))) or "0"
+    units = "policies on one encoder" if report.sweep.design == "A" else "encoders"
+    return f"{word}, {shown} (n = {counts} {units})"
+
+
+def _ends(first: Report, second: Report) -> str:
+    """Floor and ceiling in words, of both sweeps where they differ."""
+    floors = [side.floor.get("accuracy") for side in (first, second)]
+    tops = [side.ceiling and side.ceiling.mean for side in (first, second)]
+    told = []
+    for word, values in (("majority class", floors), (figures.CEILING_WORDS, tops)):
+        shown = dict.fromkeys(f"{100 * value:.1f}" for value in values if isinstance(value, float))
+        told += [f"{word} at {' and '.join(shown)} %"] if shown else []
+    return "; ".join(["(a): axis cut", *told])
 
 
 def _latents(record: SweepRecord, made: Numbers) -> list[Drawing]:

@@ -7,6 +7,8 @@ and markers differ too, so that a grey print is readable. Curves are labelled wh
 from __future__ import annotations
 
 import io
+import itertools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +19,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from numpy.typing import NDArray
 
@@ -28,6 +31,7 @@ MARKER = {"rec": "o", "rec+pred": "^", "rec+plan": "s", "full": "D"}
 FRACTION_COLOUR = ("#D55E00", "#E69F00", "#009E73", "#56B4E9", "#CC79A7")
 FRACTION_MARKER = ("D", "^", "s", "v", "P")
 LIGHT_COLOUR, LIGHT_WORDS = ("#BBBBBB", "#E69F00", "#D55E00"), ("green or none", "yellow", "red")
+SIDES = (("o", None), ("D", "white"))  # marker and fill of the first of two sweeps, and of the second
 GREY = "#666666"
 CEILING_LINE, CEILING_WORDS = ":", "true state"
 WIDTH = 6.4  # [in], the report's text width
@@ -52,6 +56,11 @@ STYLE: dict[Any, Any] = {
     "svg.fonttype": "path",
     "figure.dpi": 100,
 }
+METADATA: dict[str, dict[str, None]] = {  # of each format, what would say when and by what it was written
+    "svg": {"Date": None, "Creator": None},
+    "png": {"Software": None},
+    "pdf": {"CreationDate": None, "Creator": None, "Producer": None},
+}
 
 
 @dataclass(frozen=True)
@@ -66,25 +75,22 @@ class Drawing:
 
 
 def save(figure: Figure, folder: Path, name: str) -> tuple[Path, Path]:
-    """Write a figure as `name.svg` and `name.png` (200 dots per inch), the same bytes each time."""
+    """Write a figure as `name.svg` and `name.png`."""
     folder.mkdir(parents=True, exist_ok=True)
-    paths = []
-    for kind, metadata in (("svg", {"Date": None, "Creator": None}), ("png", {"Software": None})):
-        stream = io.BytesIO()
-        with mpl.rc_context(STYLE):
-            figure.savefig(stream, format=kind, dpi=200, metadata=metadata)
-        path = folder / f"{name}.{kind}"
-        draft = path.with_name(f".{path.name}")
-        draft.write_bytes(stream.getvalue())
-        draft.replace(path)
-        paths.append(path)
-    return paths[0], paths[1]
+    paths = folder / f"{name}.svg", folder / f"{name}.png"
+    for path in paths:
+        write(figure, path)
+    return paths
 
 
-def write_png(figure: Figure, path: Path) -> None:
-    """Write a figure as one PNG (200 dots per inch), the same bytes each time."""
+def write(figure: Figure, path: Path) -> None:
+    """Write a figure whole, in the format of its ending (METADATA; 200 dots per inch), the same bytes each time."""
+    kind, stream = path.suffix[1:].lower(), io.BytesIO()
     with mpl.rc_context(STYLE):
-        figure.savefig(path, format="png", dpi=200, metadata={"Software": None})
+        figure.savefig(stream, format=kind, dpi=200, metadata=METADATA[kind])
+    draft = path.with_name(f".{path.name}")
+    draft.write_bytes(stream.getvalue())
+    draft.replace(path)
 
 
 def _figure(height: float, columns: int = 1, rows: int = 1) -> tuple[Figure, list[Axes]]:
@@ -411,6 +417,83 @@ def both_values(rows: Sequence[Mapping[str, Any]], setting: str, values: tuple[s
         axes.set_xlabel("difference in acceleration accuracy, test [percentage points]")
         figure.legend(loc="outside upper right", ncols=2, frameon=False)
     return figure
+
+
+Range = tuple[float, float | None, float | None]  # a value and the ends of its interval, as shares
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A head set and fraction in two sweeps: None where a sweep has none, or no difference, as the baseline."""
+
+    label: str
+    heads: str
+    fraction: float
+    scores: tuple[Range | None, Range | None]
+    differences: tuple[Range | None, Range | None]
+
+
+def two_sweeps(rows: Sequence[Pair], names: tuple[str, str], baselines: tuple[str, str], note: str) -> Figure:
+    """Final accuracy [%] of two sweeps, row by row, and beside it the differences to each one's baseline [points].
+
+    `names`: what the key says of each sweep; `note`: a line below. Bars are the intervals given. Without any difference
+    there is one panel.
+    """
+    fractions = [row.fraction for row in rows]
+    places = np.cumsum([0.0, *(1.0 if one == other else 1.5 for one, other in itertools.pairwise(fractions))])
+    both = any(row.differences != (None, None) for row in rows)
+    with mpl.rc_context(STYLE):
+        figure, panels = _figure(1.7 + 0.3 * float(places[-1]), columns=1 + both)
+        for axes, part, spec in zip(panels, ("scores", "differences"), (".1f", "+.2f"), strict=False):
+            for place, row in zip(places, rows, strict=True):
+                axes.axhline(place, color=GREY, alpha=0.25, linewidth=0.4, zorder=0)
+                shift = 0.0 if None in row.scores else 0.2
+                for found, mark, y in zip(getattr(row, part), SIDES, (place - shift, place + shift), strict=True):
+                    _dot(axes, found, y, COLOUR.get(row.heads, GREY), mark, spec)
+            axes.set_yticks(places, [literal(row.label) for row in rows] if part == "scores" else [""] * len(rows))
+            axes.set_ylim(places[-1] + 0.6, -0.6)
+            axes.spines["left"].set_visible(False)
+            axes.tick_params(axis="y", length=0)
+            axes.margins(x=0.12)
+        panels[0].set_title("(a) Final acceleration accuracy, test")
+        panels[0].set_xlabel("accuracy [%]")
+        for axes in panels[1:]:
+            axes.axvline(0, color=GREY, linewidth=0.6)
+            axes.set_title(f"(b) Difference to {literal(' or '.join(dict.fromkeys(baselines)))}")
+            axes.set_xlabel("difference in accuracy [percentage points]")
+        keys = [
+            Line2D([], [], color=COLOUR["rec"], marker=marker, markerfacecolor=fill or COLOUR["rec"], markersize=4)
+            for marker, fill in SIDES
+        ]
+        figure.legend(keys, [literal(name) for name in names], loc="outside upper left", frameon=False)
+        figure.supxlabel(note, x=0.01, ha="left", fontsize=6.5, color=GREY)
+    return figure
+
+
+def _dot(axes: Axes, found: Range | None, y: float, colour: str, mark: tuple[str, str | None], spec: str) -> None:
+    """A value with its interval, and its number beside it."""
+    if found is None:
+        return
+    value, low, high = (math.nan if end is None else 100 * end for end in found)
+    axes.hlines(y, low, high, color=colour, linewidth=1.4)
+    axes.plot([value], [y], mark[0], color=colour, markerfacecolor=mark[1] or colour, markersize=3.6)
+    text, end = format(value, spec), value if math.isnan(high) else high
+    text = text.replace("-", "\N{MINUS SIGN}") if float(text) else text.lstrip("+-")
+    axes.annotate(
+        text,
+        (end, y),
+        (5, 0),
+        textcoords="offset points",
+        color=GREY,
+        va="center",
+        fontsize=6,
+        bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.8},  # above the row's line
+    )
+
+
+def literal(text: str) -> str:
+    """Words from outside, which matplotlib would else read as formulas."""
+    return text.replace("$", r"\$")
 
 
 # --- latents --------------------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
+from urllib.parse import quote
 
 from study.claims import MINUS
 
@@ -48,6 +49,12 @@ def plain(text: object) -> str:
 def code(text: object) -> str:
     """Words from outside in fixed width."""
     return f"`{' '.join(str(text).split()).replace('`', ' ').replace('|', ' ')}`"
+
+
+def picture(file: str, alt: str, caption: str) -> str:
+    """A picture with its caption; a PDF, which pages do not show inside, as a link."""
+    shown = "" if file.lower().endswith(".pdf") else "!"
+    return f"{shown}[{plain(alt)}]({quote(file)})\n\n*{plain(caption)}*"
 
 
 def rows(header: Sequence[str], body: Iterable[Sequence[str]], left: int = 1) -> str:

@@ -19,7 +19,7 @@ from PIL import Image, ImageDraw, ImageFont
 from study.birdview import Renderer, governing_light
 from study.config import ACCELERATIONS, IMAGE, BadInputError, BirdviewSettings
 from study.episode import GREEN, Episode, read_episode
-from study.figures import contact_sheet, write_png
+from study.figures import contact_sheet, write
 from study.frames import Frames, FrameStore, unpack_masks
 from study.selection import SETS
 
@@ -52,7 +52,7 @@ def write_preview(store: FrameStore, drives: Sequence[Path], folder: Path) -> tu
         draft = Path(name) / "preview"
         draft.mkdir()
         sets = {name: sample(getattr(store, name), number) for number, name in enumerate(SETS)}
-        write_png(contact_sheet(sets), draft / FILES[0])
+        write(contact_sheet(sets), draft / FILES[0])
         write_film(read_episode(drives[0]), birdview, draft / FILES[1])
         if place.exists():
             shutil.rmtree(place)

@@ -3,12 +3,13 @@
 python -m study.report heads
 python -m study.report datasize --profile smoke --tracking http://127.0.0.1:5000
 python -m study.report heads --format md > heads.md
-python -m study.report compare reports/reference/heads heads:laptop@http://127.0.0.1:5000
+python -m study.report compare reports/reference/heads heads:laptop@http://127.0.0.1:5000 --figure both.svg
 """
 
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -97,12 +98,12 @@ def parser() -> Parser:
     made = Parser(
         prog="study.report",
         usage="python -m study.report SWEEP [--profile P] [--format {pdf,md}] [--tracking URI] [--out DIR]\n"
-        "       python -m study.report compare A B [--tracking URI]",
+        "       python -m study.report compare A B [--figure FILE] [--tracking URI]",
         description="Write the report of a sweep from what MLflow holds: PDF, figures, numbers and the tidy table; or "
-        "its tables as Markdown on stdout; or set two sweeps side by side, as Markdown on stdout.",
+        "its tables as Markdown on stdout; or set two sweeps side by side, as Markdown on stdout, with a picture.",
         epilog="A and B: each a report.json, a folder that holds one, or NAME[:PROFILE][@URI] of a sweep in MLflow. "
         "Examples: python -m study.report heads --profile smoke; "
-        "python -m study.report compare reports/reference/heads heads:laptop",
+        "python -m study.report compare reports/reference/heads heads:laptop --figure both.svg > both.md",
     )
     made.add_argument(
         "words",
@@ -113,6 +114,13 @@ def parser() -> Parser:
     made.add_argument("--profile", help="of the sweep (default: that of its latest run)")
     made.add_argument("--format", choices=("pdf", "md"), default="pdf", help="default: %(default)s")
     made.add_argument("--tracking", default=DEFAULT_TRACKING, metavar="URI", help="MLflow store (default: %(default)s)")
+    made.add_argument(
+        "--figure",
+        type=Path,
+        metavar="FILE",
+        help="compare: draw both sweeps' accuracy and differences to the baseline into FILE (.svg, .png or .pdf); the "
+        "Markdown shows it by its path from the working folder",
+    )
     made.add_argument("--out", type=Path, default=Path("reports"), metavar="DIR", help="default: %(default)s")
     return made
 
@@ -126,8 +134,10 @@ def main(args: Sequence[str]) -> int:
             f"'{' '.join(options.words)}' names {len(options.words)} things; give one sweep, or: compare A B"
         )
     if name == "compare":
-        print(side_by_side(rest[0], rest[1], options.tracking), end="")
+        print(side_by_side(rest[0], rest[1], options.tracking, options.figure), end="")
         return 0
+    if options.figure:
+        raise BadInputError(f"--figure {options.figure} is for compare A B; a report has its own in DIR/SWEEP/figures")
     from study.tracking import Tracker  # noqa: PLC0415
 
     tracker = Tracker(options.tracking)
@@ -141,11 +151,45 @@ def main(args: Sequence[str]) -> int:
     return 0
 
 
-def side_by_side(first: str, second: str, tracking: str) -> str:
-    """Two sweeps' comparison as Markdown, each named by a path or as NAME[:PROFILE][@URI]."""
+def side_by_side(first: str, second: str, tracking: str, figure: Path | None = None) -> str:
+    """Two sweeps' comparison as Markdown, each named by a path or as NAME[:PROFILE][@URI]; `figure` is drawn first.
+
+    Raises BadInputError for what cannot be read, drawn or written.
+    """
     from study.comparison import compare  # noqa: PLC0415
 
-    return compare(_report(first, tracking), _report(second, tracking), (masked(first), masked(second)))
+    if figure:
+        _check_figure(figure)
+    sides, names = (_report(first, tracking), _report(second, tracking)), (masked(first), masked(second))
+    return compare(*sides, names, _draw(figure, *sides, names) if figure else "")
+
+
+def _check_figure(file: Path) -> None:
+    """Refuse what cannot become a figure, before anything is read."""
+    from study.figures import METADATA  # noqa: PLC0415
+
+    if file.suffix[1:].lower() not in METADATA:
+        raise BadInputError(
+            f"--figure {file}: write {', '.join(f'.{kind}' for kind in METADATA)}, chosen by its ending"
+        )
+    if not file.parent.is_dir():
+        raise BadInputError(f"--figure {file}: there is no folder {file.parent}; make it first: mkdir -p {file.parent}")
+    if file.is_dir():
+        raise BadInputError(f"--figure {file} is a folder; name a file in it")
+
+
+def _draw(file: Path, first: Report, second: Report, names: tuple[str, str]) -> str:
+    """Draw two sweeps into a file. Returns the Markdown that shows it."""
+    from study.drawings import draw_sweeps  # noqa: PLC0415
+    from study.figures import write  # noqa: PLC0415
+    from study.markdown import picture  # noqa: PLC0415
+
+    drawing = draw_sweeps(first, second, names)
+    try:
+        write(drawing.figure, file)
+    except OSError as error:
+        raise BadInputError(f"cannot write {file}: {error.strerror}; name another file") from error
+    return picture(Path(os.path.relpath(file)).as_posix(), drawing.alt, drawing.caption)
 
 
 def _report(source: str, tracking: str) -> Report:

@@ -60,6 +60,42 @@ def test_scores_stand_side_by_side_with_the_difference_and_its_interval(pair, te
     assert found.low < shift < found.high < 0
 
 
+def test_the_share_of_the_possible_gain_stands_beside_with_floor_and_ceiling(pair, text):
+    shares = [next(score for score in one.scores if score.heads == "full").share for one in pair]
+    assert row(text, "accuracy [%]")[5:] == ["share of gain, first [%]", "share of gain, second [%]"]
+    assert row(text, "full")[5:] == [f"{100 * share:.0f}" for share in shares]
+    assert row(text, "*ceiling (true state)*")[1:3] == [f"{100 * one.ceiling.mean:.2f} (15)" for one in pair]
+    assert row(text, "*ceiling (true state)*")[5:] == ["100", "100"]
+    assert row(text, "*floor (commonest class)*")[1:3] == [f"{100 * one.floor['accuracy']:.2f}" for one in pair]
+    assert row(text, "*floor (best constant command)*")[1:3] == [f"{1e3 * one.floor['steering']:.3f}" for one in pair]
+
+
+def test_a_report_without_a_ceiling_or_of_a_time_before_it_is_compared_without_shares(content):
+    old = {name: value for name, value in content.items() if name != "ceiling"}
+    old["scores"] = [{name: value for name, value in score.items() if name != "share"} for score in old["scores"]]
+    whole, before = checked(content, "new"), checked(old, "old")
+    text = compare(whole, before, ("new", "old"))
+    assert "share of gain" not in text
+    assert row(text, "*ceiling (true state)*")[1:] == [f"{100 * whole.ceiling.mean:.2f} (4)", *["\N{EM DASH}"] * 3]
+    assert "ceiling" not in compare(before, before, ("old", "old"))
+
+
+def test_rows_have_as_many_cells_as_their_heads(pair, text, content):
+    for one in (text, compare(pair[0], checked(content, "part"), ("whole", "part"))):
+        for block in re.findall(r"(?:^\|.*\n)+", one, flags=re.MULTILINE):
+            assert len({len(re.findall(r"(?<!\\)\|", line)) for line in block.splitlines()}) == 1
+
+
+def test_the_difference_to_the_baseline_has_the_same_sign_whichever_head_set_that_is(content):
+    one = checked(content, "a")
+    other = checked(made(simulate(SMALL.model_copy(update={"baseline": "full"}), FAST)), "b")
+    above, below = one.above_baseline(("full", 1.0)), other.above_baseline(("rec", 1.0))
+    assert 0 < above.low < above.value < above.high
+    assert (below.low, below.value, below.high) == (-above.high, -above.value, -above.low)
+    assert one.above_baseline(("rec", 1.0)) is None
+    assert one.above_baseline(("full", 0.5)) is None
+
+
 def test_an_order_that_changed_and_verdicts_that_changed_are_named(text):
     order = row(text, "100 %")
     assert order[1] == "full > rec+plan > rec+pred > rec"
@@ -81,7 +117,7 @@ def test_the_same_seeds_are_paired_and_others_are_two_samples(pair):
 def test_a_sweep_beside_itself_differs_in_nothing(pair):
     text = compare(pair[0], pair[0], ("x", "x"))
     assert "rec (the same result), rec+pred (the same result)" in text
-    assert row(text, "full")[3:] == ["0.00", "0.00 to 0.00"]
+    assert row(text, "full")[3:5] == ["0.00", "0.00 to 0.00"]
     assert "Verdicts that changed: none" in text
     assert "commit" in re.search(r"Nothing differs in: (.*)\.", text).group(1)
 
@@ -91,6 +127,15 @@ def test_cells_of_one_sweep_only_are_named(content):
     text = compare(checked(content, "part"), whole, ("part", "whole"))
     assert "Only in the second: rec+pred, rec+plan." in text
     assert row(text, "100 %")[3] == "the same"
+
+
+def test_cells_at_different_fractions_are_told_apart(content):
+    half = checked(made(simulate(SMALL.model_copy(update={"fractions": (0.5,)}), FAST)), "half")
+    text = compare(checked(content, "all"), half, ("all", "half"))
+    assert "Only in the first: rec at 100 %, full at 100 %." in text
+    assert "Only in the second: rec at 50 %, full at 50 %." in text
+    assert row(text, "*ceiling (true state)*")[3] != "\N{EM DASH}"
+    assert "### Convergence" not in text
 
 
 def test_nothing_in_common_is_said(content):

@@ -1,3 +1,5 @@
+import json
+import math
 import xml.etree.ElementTree as ET
 
 import numpy as np
@@ -5,8 +7,9 @@ import pytest
 
 from simulated import DATASIZE_GRID, HEADS_GRID, World, simulate
 from study import figures, stats
-from study.config import HEAD_SETS
-from study.drawings import draw
+from study.comparison import checked
+from study.config import HEAD_SETS, BadInputError, Grid
+from study.drawings import draw, draw_sweeps
 from study.summary import numbers
 
 
@@ -100,6 +103,17 @@ def test_saved_files_are_svg_and_png_and_nothing_is_left_beside_them(heads_figur
     assert {path.name for path in tmp_path.iterdir()} == {"f.svg", "f.png"}
 
 
+def test_a_figure_is_written_whole_in_the_format_of_its_ending(tmp_path):
+    for ending, start in ((".svg", b"<?xml"), (".PNG", b"\x89PNG"), (".pdf", b"%PDF")):
+        made = []
+        for name in ("one", "two"):
+            figures.write(figures.confusions([("rec", np.eye(3))]), tmp_path / f"{name}{ending}")
+            made.append((tmp_path / f"{name}{ending}").read_bytes())
+        assert made[0].startswith(start)
+        assert made[0] == made[1]
+    assert len(list(tmp_path.iterdir())) == 6
+
+
 def test_picture_rows_place_a_picture_of_each_row_in_each_column():
     pictures = np.arange(3, dtype=np.uint8)[:, None, None] * np.ones((3, 64, 64), np.uint8)
     figure = figures.picture_rows([("input", pictures), ("", pictures), ("target", pictures)])
@@ -152,3 +166,101 @@ def test_multi_results_shows_inputs_outputs_and_targets():
         "planning",
         "planning target",
     ]
+
+
+# --- two sweeps side by side ----------------------------------------------------------------------------------------
+
+SIDES = ("reports/first", "the $second$_one")
+
+
+def report_of(grid, seed=0):
+    return checked(json.loads(json.dumps(numbers(simulate(grid, World(epochs=8), seed=seed)))), grid.name)
+
+
+@pytest.fixture(scope="module")
+def reports():
+    return report_of(HEADS_GRID), report_of(DATASIZE_GRID, seed=1)
+
+
+@pytest.fixture(scope="module")
+def two(reports):
+    return draw_sweeps(*reports, SIDES)
+
+
+def marks(axes):
+    """Place, marker and whether it is filled, of every mark in a panel."""
+    return {
+        (round(float(line.get_xdata()[0]), 6), line.get_marker(), line.get_markerfacecolor() != "white")
+        for line in axes.lines
+        if line.get_marker() in ("o", "D")
+    }
+
+
+def test_two_sweeps_differ_by_marker_and_fill_and_share_the_head_sets_colours(two, reports):
+    left, right = two.figure.axes
+    wanted = {
+        (round(100 * score.accuracy.mean, 6), *mark)
+        for report, mark in zip(reports, (("o", True), ("D", False)), strict=True)
+        for score in report.scores
+    }
+    assert marks(left) == wanted
+    gains = {
+        (round(100 * report.above_baseline(point).value, 6), *mark)
+        for report, mark in zip(reports, (("o", True), ("D", False)), strict=True)
+        for point in report.points
+        if point[0] != "rec"
+    }
+    assert marks(right) == gains
+    coloured = {line.get_color() for line in left.lines if line.get_marker() in ("o", "D")}
+    assert coloured == set(figures.COLOUR.values())
+
+
+def test_two_sweeps_have_a_row_for_each_head_set_and_fraction_and_a_bar_for_each_interval(two, reports):
+    left, right = two.figure.axes
+    names = [label.get_text() for label in left.get_yticklabels()]
+    assert names[:5] == ["rec at 100 %", "rec+pred at 100 %", "rec+plan at 100 %", "full at 100 %", "rec at 50 %"]
+    assert len(names) == 12
+    assert left.get_ylim() == right.get_ylim()
+    spans = {tuple(np.round(path.vertices[:, 0], 6)) for bars in left.collections for path in bars.get_paths()}
+    scores = [score.accuracy for report in reports for score in report.scores]
+    assert spans == {(round(100 * own.low, 6), round(100 * own.high, 6)) for own in scores}
+
+
+def test_numbers_of_two_sweeps_do_not_touch_and_stay_inside_the_picture(reports):
+    other = reports[0].model_copy(update={"sweep": reports[0].sweep.model_copy(update={"name": "again"})})
+    figure = draw_sweeps(reports[0], other, SIDES).figure
+    figure.canvas.draw()
+    for axes in figure.axes:
+        boxes = [text.get_window_extent() for text in axes.texts]
+        assert len(boxes) == 8 - 2 * (axes is figure.axes[1])
+        for index, box in enumerate(boxes):
+            assert box.x1 <= figure.bbox.x1
+            assert not any(box.overlaps(one) for one in boxes[index + 1 :])
+
+
+def test_words_beside_two_sweeps_say_n_kind_floor_ceiling_and_which_is_which(two, reports):
+    for words in (two.caption, " ".join(texts(two.figure)).replace(r"\$", "$")):
+        assert "first, reports/first (n = 15 policies on one encoder)" in words
+        assert "second, the $second$_one (n = 15 policies on one encoder)" in words
+    assert "95 % interval (BCa" in two.caption
+    assert "difference to rec of the same sweep" in two.caption
+    floors = " and ".join(f"{100 * report.floor['accuracy']:.1f}" for report in reports)
+    assert any(f"axis cut; majority class at {floors} %; true state at" in text for text in texts(two.figure))
+    assert f"rec+pred at 100 %: {100 * reports[0].scores[1].accuracy.mean:.1f} % and none" in two.alt
+
+
+def test_one_score_without_interval_is_drawn_and_no_score_is_refused(tmp_path):
+    grid = Grid(name="one", title="One", heads=("full",), policy_seeds=1, ceiling=False)
+    one = report_of(grid)
+    assert one.scores[0].accuracy.low is None
+    drawing = draw_sweeps(one, one, ("a" * 200, "b"))
+    figures.write(drawing.figure, tmp_path / "one.png")
+    (axes,) = drawing.figure.axes
+    assert not any(
+        math.isfinite(x) for bars in axes.collections for path in bars.get_paths() for x in path.vertices[:, 0]
+    )
+    assert len(marks(axes)) == 2
+    assert "difference" not in drawing.caption
+    empty = one.model_copy(update={"scores": ()})
+    with pytest.raises(BadInputError, match="no cell is finished in a or b"):
+        draw_sweeps(empty, empty, ("a", "b"))

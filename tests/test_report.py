@@ -3,6 +3,7 @@ import re
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -220,6 +221,36 @@ def test_compare_takes_files_folders_and_sweeps_in_mlflow(tracker, committed, tm
         report.main(["compare", str(tmp_path), "nowhere/report.json"])
     with pytest.raises(BadInputError, match="compare A B"):
         report.main(["compare", str(tmp_path)])
+
+
+def test_compare_draws_into_the_file_that_it_is_given(committed, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "report.json").write_text(json.dumps(numbers(committed[0])))
+    (tmp_path / "my pictures").mkdir()
+    for file, shown in ((Path("my pictures/a.svg"), "![Dot plot"), (tmp_path / "my pictures" / "b.pdf", "\n[Dot plot")):
+        assert report.main(["compare", ".", ".", "--figure", str(file)]) == 0
+        text = capsys.readouterr().out
+        assert shown in text
+        assert f"](my%20pictures/{file.name})" in text
+    assert {path.name for path in Path("my pictures").iterdir()} == {"a.svg", "b.pdf"}
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["compare", "a", "b", "--figure", "x.jpg"], r"--figure x\.jpg: write \.svg, \.png, \.pdf"),
+        (["compare", "a", "b", "--figure", "x"], r"--figure x: write"),
+        (["compare", "a", "b", "--figure", "nowhere/x.svg"], "no folder nowhere; make it first"),
+        (["compare", "a", "b", "--figure", "folder.png"], "is a folder"),
+        (["heads", "--figure", "x.png"], "is for compare A B"),
+    ],
+)
+def test_a_figure_that_cannot_be_is_refused_before_anything_is_read(words, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "folder.png").mkdir()
+    with pytest.raises(BadInputError, match=message):
+        report.main(words)
+    assert [path.name for path in tmp_path.iterdir()] == ["folder.png"]
 
 
 def test_format_md_prints_tables_and_writes_nothing(tracker, committed, tmp_path, capsys, monkeypatch):
