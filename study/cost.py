@@ -13,10 +13,10 @@ from study.config import CEILING, HEAD_SETS, IMAGE, Cell, StudySettings
 STEP_HZ = 10
 VEHICLE_FRAMES_PER_S = 90_000.0  # simulated, on two cores
 FRAMES_PER_S = 6_000.0  # chosen and rendered, on two cores
-ENCODER_IMAGE_S = 1 / 3700  # an image forward and backward through the encoder
-HEAD_IMAGE_S = 1 / 3800  # the same for each head
+ENCODER_IMAGE_S = 1 / 2900  # an image forward and backward through the encoder
+HEAD_IMAGE_S = 1 / 3700  # the same for each head
 TEST_COST = 0.35  # an image evaluated, as a share of an image trained
-POLICY_FRAME_S = 1 / 280_000  # a frame forward and backward through one policy
+POLICY_FRAME_S = 1 / 500_000  # a frame forward and backward through one policy, on two cores
 DRIVE_READ_S = 0.12  # a drive read again for the true state
 CELL_START_S = 10.0  # a process starts, imports torch and opens the data; a result is committed
 
