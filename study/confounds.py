@@ -108,7 +108,8 @@ def contrasts(record: SweepRecord, other: SweepRecord, confound: Confound) -> li
     """Every head set against the baseline, at each fraction, that both sweeps have finished."""
     panels = [stats.panel(each.table(), stats.ACCURACY) for each in (record, other)]
     rows = []
-    for first, second in claims.planned(record.grid):
+    for pair in claims.planned(record.grid):
+        second, first = sorted(pair, key=lambda point: point[0] != record.grid.baseline)
         if second[0] != record.grid.baseline or first[1] != second[1] or (confound.fractions and first[1] == 1):
             continue
         if not all(point in panel for panel in panels for point in (first, second)):

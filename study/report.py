@@ -24,9 +24,10 @@ if TYPE_CHECKING:  # the command answers --help without the libraries that only 
     from study.tracking import Tracker
 
 TEMPLATE = Path(__file__).with_name("report.typ")
+REPORTS = Path("reports")
 
 
-def build_report(record: SweepRecord, folder: Path = Path("reports")) -> Path:
+def build_report(record: SweepRecord, folder: Path = REPORTS) -> Path:
     """Write `<folder>/<sweep>.pdf` and, under `<folder>/<sweep>/`, report.json, curves.parquet and figures/.
 
     The same record gives the same bytes. Works for a sweep with unfinished cells, and says so on its first page.
@@ -121,7 +122,7 @@ def parser() -> Parser:
         help="compare: draw both sweeps' accuracy and differences to the baseline into FILE (.svg, .png or .pdf); the "
         "Markdown shows it by its path from the working folder",
     )
-    made.add_argument("--out", type=Path, default=Path("reports"), metavar="DIR", help="default: %(default)s")
+    made.add_argument("--out", type=Path, metavar="DIR", help=f"default: {REPORTS}")
     return made
 
 
@@ -134,6 +135,9 @@ def main(args: Sequence[str]) -> int:
             f"'{' '.join(options.words)}' names {len(options.words)} things; give one sweep, or: compare A B"
         )
     if name == "compare":
+        for option, where in (("profile", "within a name: heads:smoke"), ("out", "with --figure FILE or > FILE")):
+            if getattr(options, option) is not None:
+                raise BadInputError(f"compare takes no --{option}; give it {where}")
         print(side_by_side(rest[0], rest[1], options.tracking, options.figure), end="")
         return 0
     if options.figure:
@@ -147,7 +151,7 @@ def main(args: Sequence[str]) -> int:
 
         print(written(numbers(_whole(tracker, name, options.profile))), end="")
     else:
-        print(publish(tracker, name, options.profile, options.out))
+        print(publish(tracker, name, options.profile, options.out or REPORTS))
     return 0
 
 

@@ -65,6 +65,15 @@ def test_a_difference_that_a_setting_makes_is_seen_and_one_that_it_does_not_is_n
         assert [row.first[0] for row in rows if row.state == "moved"] == ["full"] * (len(states) - 1)
 
 
+def test_differences_are_to_the_baseline_whichever_it_is():
+    record = simulate(HEADS_GRID.model_copy(update={"baseline": "full"}), FAST)
+    rows = contrasts(record, record, SPLIT)
+    assert [(row.first[0], row.second[0]) for row in rows] == [
+        (name, "full") for name in ("rec", "rec+pred", "rec+plan")
+    ]
+    assert all(row.here.value < 0 for row in rows)
+
+
 def test_what_matters_below_all_the_data_is_shown_there_only():
     record = simulate(DATASIZE_GRID, FAST)
     budget = next(confound for confound in CONFOUNDS if confound.setting == "encoder.budget")

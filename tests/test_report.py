@@ -238,6 +238,8 @@ def test_compare_draws_into_the_file_that_it_is_given(committed, tmp_path, capsy
 @pytest.mark.parametrize(
     ("words", "message"),
     [
+        (["compare", "a", "b", "--profile", "smoke"], "heads:smoke"),
+        (["compare", "a", "b", "--out", "there"], "--figure FILE"),
         (["compare", "a", "b", "--figure", "x.jpg"], r"--figure x\.jpg: write \.svg, \.png, \.pdf"),
         (["compare", "a", "b", "--figure", "x"], r"--figure x: write"),
         (["compare", "a", "b", "--figure", "nowhere/x.svg"], "no folder nowhere; make it first"),
