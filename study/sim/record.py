@@ -181,8 +181,7 @@ def record_all(
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with alone(folder / ".lock"):
-            for left in folder.glob(".*/"):  # drafts of calls that were killed
-                shutil.rmtree(left)
+            _sweep(folder)  # what calls that were killed have left
             jobs = [(town, recording, seed, path) for seed, path in zip(seeds, paths, strict=True) if not path.exists()]
             done = len(paths) - len(jobs)
             report = progress or (lambda *_: None)
@@ -190,11 +189,18 @@ def record_all(
             with Pool(min(processes, len(jobs))) as pool:
                 for number, _ in enumerate(pool.results(_record, jobs), done + 1):
                     report(number, len(paths))
+            _sweep(folder)  # and children of this one
     except OSError as error:
         if error.errno not in WRITE_ERRORS:
             raise
         raise BadInputError(cannot_write(folder, error)) from error
     return paths
+
+
+def _sweep(folder: Path) -> None:
+    """Remove drafts."""
+    for left in folder.glob(".*/"):
+        shutil.rmtree(left)
 
 
 def _record(town: TownSettings, recording: RecordingSettings, seed: int, path: Path) -> None:
