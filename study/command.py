@@ -21,7 +21,7 @@ import yaml
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from study.config import BadInputError, Grid, StudySettings, masked
+from study.config import DEFAULT_TRACKING, BadInputError, Grid, StudySettings, masked
 
 EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
 # A disk that is full, a folder that cannot be: the user can change that, anything else is a fault.
@@ -77,6 +77,13 @@ def _add(group: Any, name: str, info: FieldInfo) -> None:
     # A percent sign in argparse's help is a format character.
     text = f"{info.description or name}{usual}".replace("%", "%%")
     group.add_argument(f"--{name}", metavar="V", type=_value, default=argparse.SUPPRESS, help=text)
+
+
+def add_tracking_option(parser: argparse.ArgumentParser) -> None:
+    """Where the results are kept."""
+    parser.add_argument(
+        "--tracking", default=DEFAULT_TRACKING, metavar="URI", help="MLflow store (default: %(default)s)"
+    )
 
 
 def given(options: argparse.Namespace, names: Sequence[str]) -> dict[str, Any]:

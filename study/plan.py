@@ -11,11 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from study.command import GRID_OPTIONS, Parser, add_options, grid_overrides, study_overrides
+from study.command import GRID_OPTIONS, Parser, add_options, add_tracking_option, grid_overrides, study_overrides
 from study.config import (
     DEFAULT_GRACE,
     DEFAULT_QUEUE,
-    DEFAULT_TRACKING,
     SHARED_QUEUES,
     SWEEPS,
     BadInputError,
@@ -176,9 +175,7 @@ def add_run_options(parser: Parser, workers: str) -> None:
     """What every command takes that trains the cells of a plan; `workers` says what --workers counts."""
     parser.add_argument("--workers", type=int, default=1, metavar="N", help=f"{workers} (default: 1)")
     add_machine_options(parser)
-    parser.add_argument(
-        "--tracking", default=DEFAULT_TRACKING, metavar="URI", help="MLflow store (default: %(default)s)"
-    )
+    add_tracking_option(parser)
     parser.add_argument(
         "--queue",
         default=os.environ.get("STUDY_QUEUE", DEFAULT_QUEUE),  # not in the help: it may hold a password

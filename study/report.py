@@ -15,8 +15,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from study.command import Parser, run
-from study.config import DEFAULT_TRACKING, SWEEPS, BadInputError, masked, named_files
+from study.command import Parser, add_tracking_option, run
+from study.config import SWEEPS, BadInputError, masked, named_files
 
 if TYPE_CHECKING:  # the command answers --help without the libraries that only a report needs
     from study.comparison import Report
@@ -114,7 +114,7 @@ def parser() -> Parser:
     )
     made.add_argument("--profile", help="of the sweep (default: that of its latest run)")
     made.add_argument("--format", choices=("pdf", "md"), default="pdf", help="default: %(default)s")
-    made.add_argument("--tracking", default=DEFAULT_TRACKING, metavar="URI", help="MLflow store (default: %(default)s)")
+    add_tracking_option(made)
     made.add_argument(
         "--figure",
         type=Path,

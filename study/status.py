@@ -18,8 +18,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
-from study.command import Parser
-from study.config import DEFAULT_TRACKING, masked
+from study.command import Parser, add_tracking_option
+from study.config import masked
 from study.cost import CELL_START_S, cell_cost, clock
 from study.display import ENCODER_SHARE, STAGES, show_table
 from study.plan import Plan, add_plan_options, given_plan, look_up
@@ -153,7 +153,7 @@ def main(args: Sequence[str]) -> int:
         description="What of a sweep is finished, what runs where, what is left. Settings must be those of the sweep.",
     )
     add_plan_options(made)
-    made.add_argument("--tracking", default=DEFAULT_TRACKING, metavar="URI", help="MLflow store (default: %(default)s)")
+    add_tracking_option(made)
     made.add_argument("--json", action="store_true", help="one JSON object on stdout")
     options = made.parse(args)
     plan = given_plan(options)

@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from study.command import Parser
-from study.config import DEFAULT_TRACKING, BadInputError, Cell, StudySettings, cell_key, one_of
+from study.command import Parser, add_tracking_option
+from study.config import BadInputError, Cell, StudySettings, cell_key, one_of
 from study.cost import cell_cost
 from study.data import DATA, prepare
 from study.display import Display
@@ -176,7 +176,7 @@ def main(args: Sequence[str]) -> int:
     add_plan_options(made)
     made.add_argument("--cell", help="label or key of a finished cell, as --dry-run shows them (default: any)")
     made.add_argument("--seed", type=int, default=random.randrange(10**6), help="draws the cell (default: any)")  # noqa: S311
-    made.add_argument("--tracking", default=DEFAULT_TRACKING, metavar="URI", help="MLflow store (default: %(default)s)")
+    add_tracking_option(made)
     options = made.parse(args)
     plan = given_plan(options)
     tracker = look_up(options.tracking)
