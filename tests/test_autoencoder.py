@@ -521,7 +521,7 @@ from study.frames import open_frames
 torch.set_num_threads(1)
 autoencoder.CHECKPOINT_SECONDS = 0
 autoencoder.train_encoder(
-    open_frames(Path({str(store)!r})).encoder, "rec", 1.0, 0, EncoderSettings(epochs=12, batch=16),
+    open_frames(Path({str(store)!r})).encoder, "rec", 1.0, 0, EncoderSettings(epochs=6, batch=16),
     FramesSettings.model_validate_json({FRAMES.model_dump_json()!r}), device="cpu",
     checkpoint=Path({str(checkpoint)!r}), log=lambda epoch, losses: print(epoch, flush=True),
 )
@@ -529,11 +529,11 @@ autoencoder.train_encoder(
     with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         for line in process.stdout:
-            if int(line) == 3:
+            if int(line) == 2:
                 process.kill()
                 break
     assert process.returncode == -signal.SIGKILL
-    settings = EncoderSettings(epochs=12, batch=16)
+    settings = EncoderSettings(epochs=6, batch=16)
     assert_same(train(frames, "rec", settings), train(frames, "rec", settings, checkpoint=checkpoint))
 
 
