@@ -18,6 +18,7 @@ from pathlib import Path
 
 import pandas as pd
 import psycopg
+import pytest
 
 ROOT = Path(__file__).parent.parent
 PATIENCE = 900.0  # [s] for anything to happen: a busy machine is slow, and no test here measures speed
@@ -31,15 +32,46 @@ frames: {encoder: 40, policy: 40}
 encoder: {epochs: 3, batch: 16}
 policy: {epochs: 5, batch: 16}
 """
+PLAN = ("heads", "--profile", "tiny", "--policy_seeds", "2")
+ONE_THREAD = (*PLAN, "--threads", "1")  # which is not slow on a busy machine either
+FOUR = (*ONE_THREAD, "--ceiling", "false", "--workers", "2")
+QUIET_SECONDS = 12.0  # of FOUR on two quiet cores, in memory
 
 
-def working_folder(folder: Path, data: Path | None = None) -> Path:
-    """A folder to run sweeps in; with the drives and frames of the working folder `data`, but nothing trained."""
+def working_folder(folder: Path) -> Path:
+    """A folder to run sweeps in."""
     shutil.copytree(ROOT / "sweeps", folder / "sweeps")
     (folder / "sweeps/profiles/tiny.yaml").write_text(TINY)
-    for name in ("data/episodes", "data/frames") if data else ():
-        shutil.copytree(data / name, folder / name)
     return folder
+
+
+@dataclass(frozen=True)
+class Quiet:
+    """A working folder in which all four cells of `FOUR` have run undisturbed, and how slow the machine is just now."""
+
+    folder: Path
+    pace: float  # 1 on two quiet cores, more on a busy machine
+    empty: Path  # an empty store
+
+    def copy(self, folder: Path) -> Path:
+        """Another working folder, with the drives and frames of this one and an empty store: nothing is trained."""
+        working_folder(folder)
+        for name in ("data/episodes", "data/frames"):
+            shutil.copytree(self.folder / name, folder / name)
+        (folder / "mlruns").mkdir()
+        shutil.copy(self.empty, folder / "mlruns/mlflow.db")
+        return folder
+
+
+@pytest.fixture(scope="session")
+def quiet(empty_store: Path, tmp_path_factory: pytest.TempPathFactory) -> Quiet:
+    folder = working_folder(tmp_path_factory.mktemp("quiet"))
+    began = time.monotonic()
+    run = Running(folder, *command(*FOUR))
+    assert run.end() == 0, run.said
+    assert len(store(folder).results()) == 4
+    assert leftovers(folder) == []
+    return Quiet(folder, max(1.0, (time.monotonic() - began) / QUIET_SECONDS), empty_store)
 
 
 def command(*words: str) -> list[str]:
@@ -84,7 +116,7 @@ class Running:
             if sign():
                 return True
             assert time.monotonic() < deadline, f"no sign for {PATIENCE:.0f} s:\n{self.said}"
-            time.sleep(0.02)
+            time.sleep(0.05)
         return False
 
     def end(self) -> int:

@@ -207,8 +207,10 @@ class TrackingServer:
 
 
 @pytest.fixture
-def tracking_server(tmp_path: Path) -> Iterator[TrackingServer]:
+def tracking_server(tmp_path: Path, empty_store: Path) -> Iterator[TrackingServer]:
     """An MLflow server of its own on SQLite; who needs its store in PostgreSQL makes a TrackingServer."""
+    (tmp_path / "tracking").mkdir()
+    shutil.copy(empty_store, tmp_path / "tracking")
     server = TrackingServer(tmp_path / "tracking")
     yield server
     server.stop()

@@ -1,4 +1,4 @@
-"""One small frame store and its drives, made once for all tests that only look at them."""
+"""Stores made once for all tests: small frames with their drives to look at, an empty MLflow store to copy."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import pytest
 from drives import write_drives
 from study.config import BirdviewSettings, FramesSettings
 from study.frames import build_frames
+from study.store import SQLITE, open_store
 
 
 @pytest.fixture(scope="session")
@@ -24,4 +25,12 @@ def small_store(small_drives: list[Path], tmp_path_factory: pytest.TempPathFacto
     made = tmp_path_factory.mktemp("frames") / "store"
     settings = FramesSettings(encoder=60, policy=40)
     build_frames(settings, BirdviewSettings(), small_drives[:3], small_drives[3:], made, 1)
+    return made
+
+
+@pytest.fixture(scope="session")
+def empty_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A database file with MLflow's tables and nothing in them: making them takes seconds, copying them nothing."""
+    made = tmp_path_factory.mktemp("empty") / "mlflow.db"
+    open_store(f"{SQLITE}{made}")
     return made

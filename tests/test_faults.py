@@ -10,42 +10,18 @@ import sys
 import time
 from collections import Counter
 from contextlib import suppress
-from dataclasses import dataclass
-from pathlib import Path
 from typing import ClassVar
 
 import pytest
 
-from running import ROOT, Running, Store, check_like, command, leftovers, store, working_folder
+from running import FOUR, ROOT, Running, Store, check_like, command, leftovers, store, working_folder
 from servers import TrackingServer
 
 pytestmark = pytest.mark.slow
 
-TINY = ("heads", "--profile", "tiny", "--policy_seeds", "2", "--threads", "1", "--ceiling", "false")
-FOUR = (*TINY, "--workers", "2")
 TWO = (*FOUR, "--heads", "[rec,full]")
-EIGHT = (*TINY, "--encoder_seeds", "2")
-QUIET_SECONDS = 20.0  # of the undisturbed run on two quiet cores
+EIGHT = (*FOUR, "--encoder_seeds", "2")
 HINT = "Nothing that was finished is lost"
-
-
-@dataclass(frozen=True)
-class Quiet:
-    """A working folder in which all four cells have run undisturbed, and how slow the machine is just now."""
-
-    folder: Path
-    pace: float  # 1 on two quiet cores, more on a busy machine
-
-
-@pytest.fixture(scope="module")
-def quiet(tmp_path_factory):
-    folder = working_folder(tmp_path_factory.mktemp("quiet"))
-    began = time.monotonic()
-    run = Running(folder, *command(*FOUR))
-    assert run.end() == 0, run.said
-    assert len(store(folder).results()) == 4
-    assert leftovers(folder) == []
-    return Quiet(folder, max(1.0, (time.monotonic() - began) / QUIET_SECONDS))
 
 
 # --- the storm ------------------------------------------------------------------------------------------------------
@@ -96,7 +72,7 @@ def test_a_storm_of_kills_changes_nothing(quiet, tmp_path):
     """SIGKILL at random moments of every stage, to the parent and to each kind of child."""
     rng = random.Random("storm")
     folder = working_folder(tmp_path)
-    run = Running(folder, *command(*FOUR))
+    run = Running(folder, *command(*FOUR), "--no-report")
     kills, kept = Counter(), set()
     for phase in BLOWS:
         blows = [(stage, role) for stage, role, times in phase for _ in range(times)]
@@ -104,7 +80,7 @@ def test_a_storm_of_kills_changes_nothing(quiet, tmp_path):
         while blows:
             stage, role = blows[-1]
             if not run.running:
-                run = Running(folder, *command(*FOUR))
+                run = Running(folder, *command(*FOUR), *([] if stage == "report" else ["--no-report"]))
             if not run.until(lambda run=run, stage=stage: SIGNS[stage](run) or gone_by(run, stage)):
                 if run.end() == 0 and stage != "report":  # nothing is left that could be hit there
                     break
@@ -135,8 +111,8 @@ def test_a_storm_of_kills_changes_nothing(quiet, tmp_path):
 
 def test_processes_that_stand_still_for_a_while_do_no_harm(quiet, tmp_path):
     """A child is stopped until another cell is finished, then the parent until a child has ended."""
-    folder = working_folder(tmp_path, quiet.folder)
-    run = Running(folder, *command(*FOUR))
+    folder = quiet.copy(tmp_path)
+    run = Running(folder, *command(*TWO))
     assert run.until(lambda: run.of("cell"))
     still = run.of("cell")[0]
     run.send(signal.SIGSTOP, still)
@@ -151,7 +127,7 @@ def test_processes_that_stand_still_for_a_while_do_no_harm(quiet, tmp_path):
 
 
 def test_of_two_parents_started_at_once_one_works_and_one_is_told(quiet, tmp_path):
-    folder = working_folder(tmp_path, quiet.folder)
+    folder = quiet.copy(tmp_path)
     twins = [Running(folder, *command(*TWO)) for _ in range(2)]
     codes = [twin.end() for twin in twins]
     assert sorted(codes) == [0, 2]
@@ -161,7 +137,7 @@ def test_of_two_parents_started_at_once_one_works_and_one_is_told(quiet, tmp_pat
 
 def test_damaged_files_are_told_and_made_again(quiet, tmp_path):
     """A frame, a checkpoint and a result that waits to be committed, damaged between two starts."""
-    folder = working_folder(tmp_path, quiet.folder)
+    folder = quiet.copy(tmp_path)
     (image,) = folder.glob("data/frames/*/encoder/images.npy")
     shutil.copytree(quiet.folder / "data/encoders", folder / "data/encoders")
     for key, at in store(quiet.folder).folders().items():
@@ -193,7 +169,7 @@ time.time_ns = lambda: _time_ns() + int(shift() * 1e9)
 
 def test_a_clock_that_jumps_changes_nothing(quiet, tmp_path):
     """Five hours forth while a cell is trained, ten back while the next one is."""
-    folder = working_folder(tmp_path / "sweep", quiet.folder)
+    folder = quiet.copy(tmp_path / "sweep")
     (tmp_path / "sitecustomize.py").write_text(CLOCK)
     shift = tmp_path / "shift"
     shift.write_text("0")
@@ -217,7 +193,7 @@ def move(shift, hours):
 
 def test_a_stopped_sweep_ends_within_five_seconds_and_says_how_to_go_on(quiet, tmp_path):
     """Ctrl-C, which reaches all processes of a terminal, and a batch system's SIGTERM."""
-    folder = working_folder(tmp_path, quiet.folder)
+    folder = quiet.copy(tmp_path)
     long = ("--recording.duration", "3600", "--recording.warm_up", "0")  # drives that take minutes each
     for words, sign, how, whom in (
         ((*TWO, *long), lambda run: run.of("data"), signal.SIGINT, "all"),
@@ -294,8 +270,8 @@ class Lab:
 
     modules: ClassVar = {"one": "study.sweep", "two": "study.sweep", "three": "study.worker"}
 
-    def __init__(self, folder, data, *words):
-        self.where = {name: working_folder(folder / name, data) for name in self.modules}
+    def __init__(self, folder, quiet, *words):
+        self.where = {name: quiet.copy(folder / name) for name in self.modules}
         self._words, self._rng = words, random.Random("lab")
         self.kills = Counter()
         self.crew = {name: self._begin(name) for name in self.modules}
@@ -322,13 +298,13 @@ class Lab:
 
 
 def test_a_shared_queue_survives_kills_stops_and_lost_servers(quiet, postgres, tmp_path):
-    alone = working_folder(tmp_path / "alone", quiet.folder)
-    undisturbed = Running(alone, *command(*EIGHT, "--workers", "2"))
+    alone = shutil.copytree(quiet.folder, tmp_path / "alone")  # four of the eight are there
+    undisturbed = Running(alone, *command(*EIGHT))
     queue, database = postgres.uri(), postgres.uri()
     server = TrackingServer(tmp_path / "server", database)
     kept = Store(database, tmp_path / "server/files")
     grace = str(round(3 + 2 * quiet.pace))
-    lab = Lab(tmp_path, quiet.folder, "--queue", queue, "--tracking", server.uri, "--grace", grace, "--workers", "1")
+    lab = Lab(tmp_path, quiet, "--queue", queue, "--tracking", server.uri, "--grace", grace, "--workers", "1")
     try:
         lab.hit("one", "cell")
         lab.hit("two", "cell")

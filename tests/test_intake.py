@@ -3,12 +3,11 @@
 import dataclasses
 import json
 import shutil
-import sqlite3
-from collections import Counter
 
 import numpy as np
 import pytest
 
+from running import store
 from simulated import EPISODES, FRAMES, World, simulate_cell
 from study.command import EXIT_INTERRUPTED
 from study.config import BadInputError
@@ -72,13 +71,6 @@ def here(tmp_path, monkeypatch, request):
     return tmp_path
 
 
-def cell_runs(here):
-    """How many runs of cells there are, by status."""
-    query = "select status from runs join tags using (run_uuid) where key = 'kind' and value = 'cell'"
-    with sqlite3.connect(here / "mlruns/mlflow.db") as database:
-        return Counter(status for (status,) in database.execute(query))
-
-
 def test_an_import_that_was_stopped_goes_on_and_commits_every_cell_once(here, plan, folder, monkeypatch, capsys):
     commit, left = Tracker.commit, [1]
 
@@ -91,10 +83,10 @@ def test_an_import_that_was_stopped_goes_on_and_commits_every_cell_once(here, pl
     monkeypatch.setattr(Tracker, "commit", stopped)
     assert main([*PLAN, "--import-results", str(folder)]) == EXIT_INTERRUPTED
     monkeypatch.setattr(Tracker, "commit", commit)
-    assert cell_runs(here) == {"FINISHED": 1, "KILLED": 1}
+    assert store(here).cells() == {"FINISHED": 1, "KILLED": 1}
     for _ in range(2):
         assert main([*PLAN, "--import-results", str(folder)]) == 0
-        assert cell_runs(here) == {"FINISHED": 2, "KILLED": 1}
+        assert store(here).cells() == {"FINISHED": 2, "KILLED": 1}
 
     record = Tracker().read_sweep("heads")
     assert record.complete
@@ -106,14 +98,16 @@ def test_an_import_that_was_stopped_goes_on_and_commits_every_cell_once(here, pl
     assert sorted(path.name for path in folder.glob("*/")) == sorted(plan.cells)  # nothing is taken away
 
 
-def test_what_is_missing_is_listed_and_not_trained(here, plan, folder, capsys):
+def test_what_is_missing_is_listed_and_not_trained(here, plan, folder, empty_store, capsys):
+    (here / "mlruns").mkdir()
+    shutil.copy(empty_store, here / "mlruns")
     gone, there = plan.cells
     shutil.rmtree(folder / gone)
     assert main([*PLAN, "--import-results", str(folder)]) == 0
     said = capsys.readouterr().err
     assert f"missing: rec 100% e0 ({gone})" in said
     assert f"full 100% e0 ({there}): imported" in said
-    assert cell_runs(here) == {"FINISHED": 1}
+    assert store(here).cells() == {"FINISHED": 1}
     assert not (here / "data").exists()
 
 

@@ -7,6 +7,7 @@ no package of a lock file carries one that starts without libraries of the syste
 import http.client
 import json
 import re
+import shutil
 import tempfile
 import urllib.parse
 from pathlib import Path
@@ -33,8 +34,8 @@ REFERENCE = Path(__file__).parents[1] / "reports" / "reference" / "heads"
 
 
 @pytest.fixture(scope="module")
-def server(tmp_path_factory):
-    running = TrackingServer(tmp_path_factory.mktemp("ui"))
+def server(empty_store, tmp_path_factory):
+    running = TrackingServer(Path(shutil.copy(empty_store, tmp_path_factory.mktemp("ui"))).parent)
     yield running
     running.stop()
 

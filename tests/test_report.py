@@ -1,5 +1,6 @@
 import json
 import re
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -160,10 +161,10 @@ def test_the_datasize_report_has_its_claims(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def tracker(tmp_path_factory):
+def tracker(empty_store, tmp_path_factory):
     from study.tracking import Tracker
 
-    return Tracker(f"sqlite:///{tmp_path_factory.mktemp('tracking')}/mlflow.db")
+    return Tracker(f"sqlite:///{shutil.copy(empty_store, tmp_path_factory.mktemp('tracking'))}")
 
 
 @pytest.fixture(scope="module")

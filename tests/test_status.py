@@ -3,6 +3,7 @@
 import json
 import os
 import platform
+import shutil
 import subprocess
 import sys
 import time
@@ -90,8 +91,8 @@ def test_where_nothing_was_tracked_all_cells_wait_and_nothing_is_made(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["sweeps"]
 
 
-def test_a_store_without_sweeps_is_left_as_it_is(tmp_path, capsys):
-    uri = f"sqlite:///{tmp_path}/mlflow.db"
+def test_a_store_without_sweeps_is_left_as_it_is(tmp_path, empty_store, capsys):
+    uri = f"sqlite:///{shutil.copy(empty_store, tmp_path)}"
     tracker = Tracker(uri, "another")
     assert main(["heads", "--tracking", uri, "--json"]) == 0
     assert {cell["state"] for cell in json.loads(capsys.readouterr().out)["cells"]} == {"waiting"}

@@ -1,75 +1,35 @@
 """The whole way on the smoke profile: from an empty folder to the PDF."""
 
 import json
-import os
 import re
 import shutil
-import sqlite3
 import subprocess
 import sys
 from collections import Counter
-from pathlib import Path
 
 import pytest
 
+from running import FOUR, PLAN, ROOT, environment, store, sweep, working_folder
 from study.tracking import Tracker
 
 pytestmark = pytest.mark.slow
 
-ROOT = Path(__file__).parent.parent
-SMALL = ("--profile", "smoke", "--policy_seeds", "3")
+SMOKE = ("--profile", "smoke", "--threads", "1")
+SMALL = (*SMOKE, "--policy_seeds", "3")
 TWO = ("--heads", "[rec,full]")
-LESS = ("--ceiling", "false")
-
-
-def command(*words):
-    """A sweep with one thread for each cell, which is not slow on a busy machine either."""
-    return [sys.executable, "-m", "study.sweep", *words, "--threads", "1"]
-
-
-def ask(folder, *words):
-    words = [sys.executable, "-m", "study.sweep", *words]
-    return subprocess.run(words, cwd=folder, capture_output=True, text=True, check=False, env=environment())
-
-
-def sweep(folder, *words):
-    return subprocess.run(command(*words), cwd=folder, capture_output=True, text=True, check=False, env=environment())
-
-
-def environment():
-    return os.environ | {"PYTHONPATH": str(ROOT)}
-
-
-def status(folder, *words):
-    done = sweep(folder, *words, "--dry-run", "--json")
-    return Counter(cell["status"] for cell in json.loads(done.stdout)["cells"])
-
-
-def runs(folder):
-    """How many runs of cells there are, by status."""
-    query = "select status from runs join tags using (run_uuid) where key = 'kind' and value = 'cell'"
-    with sqlite3.connect(folder / "mlruns/mlflow.db") as database:
-        return Counter(status for (status,) in database.execute(query))
-
-
-def table(folder):
-    return Tracker(f"sqlite:///{folder}/mlruns/mlflow.db").read_sweep("heads").table()
-
-
-def take(folder, to):
-    """A working folder with the drives and frames of another, but nothing trained."""
-    for name in ("sweeps", "data/episodes", "data/frames"):
-        shutil.copytree(folder / name, to / name)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A working folder in which `heads` has run with two head sets and the ceiling."""
-    made = tmp_path_factory.mktemp("sweep")
-    shutil.copytree(ROOT / "sweeps", made / "sweeps")
+    made = working_folder(tmp_path_factory.mktemp("sweep"))
     done = sweep(made, "heads", *SMALL, *TWO)
     assert done.returncode == 0, done.stderr
     return made
+
+
+def table(folder):
+    return Tracker(f"sqlite:///{folder}/mlruns/mlflow.db").read_sweep("heads").table()
 
 
 def test_a_sweep_ends_with_its_report(folder):
@@ -83,20 +43,22 @@ def test_a_sweep_run_holds_the_data_card(folder):
 
 
 def test_the_same_command_again_trains_nothing(folder):
-    before = runs(folder)
-    done = sweep(folder, "heads", *SMALL, *TWO)
+    before = store(folder).cells()
+    done = sweep(folder, "heads", *SMALL, *TWO, "--no-report")
     assert done.returncode == 0
     assert "3 of 3 cells finished" in done.stderr
-    assert runs(folder) == before
+    assert store(folder).cells() == before
 
 
 def test_datasize_reuses_the_cells_of_heads(folder):
-    assert status(folder, "datasize", *SMALL, "--fractions", "[1.0,0.5]") == {"finished": 3, "waiting": 2}
+    done = sweep(folder, "datasize", *SMALL, "--fractions", "[1.0,0.5]", "--dry-run", "--json")
+    states = Counter(cell["status"] for cell in json.loads(done.stdout)["cells"])
+    assert states == {"finished": 3, "waiting": 2}
 
 
-def test_a_failed_cell_leaves_the_others_is_told_and_runs_again_when_asked_for(folder, tmp_path):
-    take(folder, tmp_path)
-    words = ("heads", *SMALL, "--heads", "[rec,rec+pred]", "--encoder.lr", "1e30", *LESS, "--no-report")
+def test_a_failed_cell_leaves_the_others_is_told_and_runs_again_when_asked_for(quiet, tmp_path):
+    quiet.copy(tmp_path)
+    words = (*FOUR, "--heads", "[rec,rec+pred]", "--encoder.lr", "1e30", "--no-report")
     for more, tries in ((), 2), ((), 2), (("--retry-failed",), 4):
         done = sweep(tmp_path, *words, *more)
         assert done.returncode == 1
@@ -104,22 +66,25 @@ def test_a_failed_cell_leaves_the_others_is_told_and_runs_again_when_asked_for(f
         assert "failed: rec+pred 100% e0" in done.stderr
         assert "epoch" in done.stderr
         assert " --retry-failed\n" in done.stderr
-        assert runs(tmp_path) == {"FAILED": tries}
+        assert store(tmp_path).cells() == {"FAILED": tries}
 
 
-def test_four_workers_give_the_table_of_one(folder, tmp_path):
-    take(folder, tmp_path)
-    done = sweep(tmp_path, "heads", *SMALL, *TWO, "--workers", "4", "--no-report")
+def test_four_workers_give_the_table_of_two(quiet, tmp_path):
+    quiet.copy(tmp_path)
+    done = sweep(tmp_path, *FOUR, "--workers", "4", "--no-report")
     assert done.returncode == 0, done.stderr
-    assert table(tmp_path).to_csv() == table(folder).to_csv()
+    assert table(tmp_path).to_csv() == table(quiet.folder).to_csv()
 
 
-def test_a_finished_cell_computed_again_has_the_same_bytes(folder):
-    before = runs(folder), {path.name for path in (folder / "data").iterdir()}
-    done = ask(folder, "verify", "heads", *SMALL, *TWO)
+def test_a_finished_cell_computed_again_has_the_same_bytes(quiet):
+    def kept():
+        return store(quiet.folder).cells(), {path.name for path in (quiet.folder / "data").iterdir()}
+
+    before = kept()
+    done = sweep(quiet.folder, "verify", *PLAN, "--ceiling", "false")
     assert done.returncode == 0, done.stdout + done.stderr
     assert "equal: curves, weights, samples and predictions, byte for byte" in done.stdout
-    assert (runs(folder), {path.name for path in (folder / "data").iterdir()}) == before
+    assert kept() == before
 
 
 def test_a_result_tells_what_made_it(folder):
@@ -132,9 +97,10 @@ def test_a_result_tells_what_made_it(folder):
 
 def test_encoders_that_differ_by_their_seed_alone_show_no_effect(folder, tmp_path):
     """The real null study: four encoders of rec pose as the four head sets, in each of the 24 orders."""
-    take(folder, tmp_path)
-    words = ("heads", "--profile", "smoke", "--heads", "[rec]", "--encoder_seeds", "4", *LESS, "--no-report")
-    done = sweep(tmp_path, *words)
+    for name in ("sweeps", "data/episodes", "data/frames"):
+        shutil.copytree(folder / name, tmp_path / name)
+    words = ("heads", *SMOKE, "--heads", "[rec]", "--encoder_seeds", "4", "--ceiling", "false", "--no-report")
+    done = sweep(tmp_path, *words, "--workers", "2")
     assert done.returncode == 0, done.stderr
     words = [sys.executable, ROOT / "benchmarks/null_study.py", "heads", "--profile", "smoke"]
     told = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=True, env=environment()).stdout

@@ -64,8 +64,9 @@ def cells(prefix, grid=GRID):
 
 
 @pytest.fixture(scope="module")
-def uri(tmp_path_factory):
+def uri(empty_store, tmp_path_factory):
     folder = tmp_path_factory.mktemp("store")
+    shutil.copy(empty_store, folder)
     before = Path.cwd()
     os.chdir(folder)  # MLflow makes a folder of its own where it is
     yield f"{SQLITE}{folder}/mlflow.db"
@@ -511,8 +512,10 @@ def test_a_finished_cell_without_its_whole_result_is_one_clear_error(tracker, da
         tracker.read_sweep("heads")
 
 
-def test_a_moved_store_keeps_its_artifacts(tmp_path, network):
+def test_a_moved_store_keeps_its_artifacts(tmp_path, network, empty_store):
     old, new = tmp_path / "old", tmp_path / "new place #1"
+    old.mkdir()
+    shutil.copy(empty_store, old)
     planned = cells("moved")
     first = Tracker(f"{SQLITE}{old}/mlflow.db")
     sweep = open_sweep(first, planned)
