@@ -184,7 +184,7 @@ def test_a_dead_workers_cell_waits_again_after_the_grace_period_and_the_try_coun
     dead.close()  # no heartbeat any more
     other.plan(["k1"])
     assert other.take() is None
-    time.sleep(GRACE + 1.5)
+    time.sleep(GRACE + 0.7)
     other.plan(["k1"])
     assert other.take().attempt == 2
 
@@ -192,7 +192,7 @@ def test_a_dead_workers_cell_waits_again_after_the_grace_period_and_the_try_coun
 def test_a_living_workers_cell_stays_its_own(database):
     living, other = planned(database, ["k1"]), planned(database, ["k1"])
     ticket = living.take()
-    time.sleep(GRACE + 1.5)
+    time.sleep(GRACE + 0.7)
     other.plan(["k1"])
     assert other.take() is None
     assert living.hold(ticket) is ticket
@@ -202,12 +202,12 @@ def test_a_worker_that_was_away_too_long_takes_its_cell_up_again_or_lets_it_go(d
     away, other = planned(database, ["k1"]), planned(database, ["k1"])
     ticket = away.take()
     away.close()
-    time.sleep(GRACE + 1.5)
+    time.sleep(GRACE + 0.7)
     other.plan(["k1"])
     again = away.hold(ticket)
     assert again is not None
     assert again.number != ticket.number
-    time.sleep(GRACE + 1.5)
+    time.sleep(GRACE + 0.7)
     other.plan(["k1"])
     taken = other.take()
     assert away.hold(again) is None
