@@ -315,17 +315,17 @@ def test_a_shared_queue_survives_kills_stops_and_lost_servers(quiet, postgres, t
         time.sleep(2)
         postgres.start()
         server.start()
+
+        # One that has a cell stands still until the others have finished all.
+        lab.await_cell("two")
+        family = list(lab.crew["two"].family())
+        lab.crew["two"].send(signal.SIGSTOP, *family)
         finished = set()
         for name in ("one", "three"):
             lab.hit(name, "parent")
             lab.begin_again(name)
             assert finished <= set(kept.folders()), "a finished cell was lost"
             finished = set(kept.folders())
-
-        # One that has a cell stands still until the others have finished all.
-        lab.await_cell("two")
-        family = list(lab.crew["two"].family())
-        lab.crew["two"].send(signal.SIGSTOP, *family)
         assert [lab.crew[name].end() for name in ("one", "three")] == [0, 0], lab.crew["one"].said
         assert len(kept.folders()) == 8
         lab.crew["two"].send(signal.SIGCONT, *family)
