@@ -63,6 +63,7 @@ def test_three_workers_one_of_them_killed_give_the_table_of_one_machine(quiet, p
 
     victim = start("study.worker", killed)
     assert victim.until(lambda: "starting" in victim.said), victim.said
+    victim.send(signal.SIGSTOP, victim.process.pid)  # so that cells are left for the others, however fast it is
     others = [start("study.worker", second), start("study.worker", third)]
     others.append(start("study.sweep", lead, "--workers", "0"))
     assert others[0].until(lambda: "starting" in others[0].said), others[0].said
