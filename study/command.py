@@ -133,12 +133,52 @@ def cannot_write(path: Path, error: OSError) -> str:
 
 def stoppable(work: Callable[[], int], command: str) -> int:
     """Do the work and return its exit code; Ctrl-C, or a batch system's SIGTERM, ends it with how to go on."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    _interrupts.pressed = False
+    for number in (signal.SIGINT, signal.SIGTERM):
+        if signal.getsignal(number) is not signal.SIG_IGN:  # as nohup and shells leave it for what they start behind
+            signal.signal(number, _interrupts)
     try:
         return work()
     except KeyboardInterrupt:
         print(f"\nStopped. Nothing that was finished is lost. To go on: {command}", file=sys.stderr)
         return EXIT_INTERRUPTED
+
+
+class _Interrupts:
+    """A signal handler that remembers, and raises KeyboardInterrupt unless it is held."""
+
+    pressed = False
+    held = 0
+
+    def __call__(self, *_: object) -> None:
+        self.pressed = True
+        self.check()
+
+    def check(self) -> None:
+        if self.pressed and not self.held:
+            raise KeyboardInterrupt
+
+
+_interrupts = _Interrupts()
+
+
+@contextmanager
+def unbroken() -> Iterator[None]:
+    """Under `stoppable`, have a Ctrl-C wait for the end of the block, which must be short.
+
+    An exception that rises anywhere in a library may be written out, or dropped: in a finaliser Python does the latter.
+    """
+    _interrupts.held += 1
+    try:
+        yield
+    finally:
+        _interrupts.held -= 1
+    check_stopped()
+
+
+def check_stopped() -> None:
+    """Raise KeyboardInterrupt after a Ctrl-C or SIGTERM under `stoppable`, whether or not it was raised before."""
+    _interrupts.check()
 
 
 def typed(module: str, args: Sequence[str]) -> str:

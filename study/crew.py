@@ -17,8 +17,8 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
@@ -26,7 +26,7 @@ from typing import Any, ParamSpec, Self, TypeVar
 
 from study import child
 from study.card import card_files, source_drives
-from study.command import EXIT_FAILED
+from study.command import EXIT_FAILED, check_stopped, unbroken
 from study.config import BadInputError
 from study.cost import cell_cost
 from study.data import DATA, prepare
@@ -157,20 +157,38 @@ class Crew:
 
     def run(self) -> dict[str, str]:
         """Run until every wanted cell is finished or given up. Returns the latter, with the reasons."""
-        while True:
-            if time.monotonic() >= self._next_look:
-                self._patiently(self._look)
-                while self._slots and (ticket := self._patiently(self._queue.take)):
-                    self._patiently(self._start, ticket)
-                if not self._running and self._wanted <= set(self._queue.failed):
-                    break
-            for messages in wait([worker.messages for worker in self._running], timeout=1.0):
-                self._listen(next(worker for worker in self._running if worker.messages is messages))
+        while self._hand_out():
+            ready = wait([worker.messages for worker in self._running], timeout=1.0)
+            with self._calm():
+                for messages in ready:
+                    self._listen(next(worker for worker in self._running if worker.messages is messages))
             self._display.tick()
         failed = {key: reason for key, reason in self._queue.failed.items() if key in self._wanted}
-        self._patiently(self._tracker.close_sweep, self._sweep_run, "FAILED" if failed else "FINISHED")
-        self._queue.close()
+        with self._calm():
+            self._patiently(self._tracker.close_sweep, self._sweep_run, "FAILED" if failed else "FINISHED")
+            self._queue.close()
         return failed
+
+    def _hand_out(self) -> bool:
+        """Give free slots a cell each, when it is time to look. Returns whether anything is left to wait for."""
+        if time.monotonic() < self._next_look:
+            return True
+        with self._calm():
+            self._patiently(self._look)
+        while self._slots:
+            with self._calm():
+                ticket = self._patiently(self._queue.take)
+            if ticket is None:
+                break
+            self._patiently(self._start, ticket)
+        return bool(self._running) or not self._wanted <= set(self._queue.failed)
+
+    @contextmanager
+    def _calm(self) -> Iterator[None]:
+        """Have Ctrl-C wait while files are written. For a server it does not, which may be long in answering."""
+        with nullcontext() if self._patience else unbroken():
+            yield
+        check_stopped()
 
     def _look(self) -> None:
         """See what others have done, and make wait what is neither finished nor open."""
@@ -188,16 +206,17 @@ class Crew:
         self._next_look = time.monotonic() + POLL if self._queue.shared else float("inf")
 
     def _start(self, ticket: Ticket) -> None:
-        if self._tracker.finished([ticket.key]):  # by a process that could not tell the queue
-            self._queue.drop(ticket)
-            self._finish(ticket.key)
-            return
         job = dataclasses.replace(self._jobs[ticket.key], slot=self._slots[0])
-        run = self._tracker.start_cell(self._sweep_run, job.cell, job.key, job.settings, job.policy_seeds)
-        if result := _trained(job):  # before; only the commit was cut off
-            self._commit(job, ticket, run, result)
-            return
-        process, messages = child.start(job)
+        with self._calm():
+            if self._tracker.finished([ticket.key]):  # by a process that could not tell the queue
+                self._queue.drop(ticket)
+                self._finish(ticket.key)
+                return
+            run = self._tracker.start_cell(self._sweep_run, job.cell, job.key, job.settings, job.policy_seeds)
+            if result := _trained(job):  # before; only the commit was cut off
+                self._commit(job, ticket, run, result)
+                return
+        process, messages = child.start(job)  # the first waits for torch
         self._slots.remove(job.slot)
         self._running.append(Worker(job, ticket, run, process, messages))
         self._display.start(job.key)

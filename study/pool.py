@@ -12,7 +12,7 @@ from concurrent.futures.process import BrokenProcessPool
 from types import TracebackType
 from typing import Any, Self
 
-from study.command import deaf_to_interrupts, obey_parent
+from study.command import check_stopped, deaf_to_interrupts, obey_parent
 from study.config import BadInputError
 
 TRIES = 5  # with not one task finished in between
@@ -46,6 +46,7 @@ class Pool:
             futures = self._submit(function, left)
             tries -= 1
             for future in as_completed(futures):
+                check_stopped()
                 try:
                     result = future.result()
                 except BrokenProcessPool:  # each that is not done says so

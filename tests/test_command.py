@@ -1,10 +1,13 @@
 """The command line: errors are one line and exit code 2, and nothing heavy is loaded to answer --help."""
 
 import json
+import signal
 import subprocess
 import sys
 
 import pytest
+
+from study.command import EXIT_INTERRUPTED, check_stopped, stoppable, unbroken
 
 HEAVY = ("torch", "lightning", "mlflow", "optuna", "matplotlib", "highway_env", "cv2", "pandas")
 
@@ -70,3 +73,44 @@ def test_help_and_dry_run_load_nothing_heavy(words):
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stderr.strip() == "[]"
+
+
+@pytest.fixture
+def handlers():
+    """Whatever answers Ctrl-C and SIGTERM now does so again afterwards."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_stop_waits_for_what_must_not_break(handlers, number, capsys):
+    done = []
+
+    def work():
+        with unbroken():
+            with unbroken():
+                signal.raise_signal(number)
+            done.append("whole")
+        done.append("more")
+        return 0
+
+    assert stoppable(work, "this again") == EXIT_INTERRUPTED
+    assert done == ["whole"]
+    assert "To go on: this again" in capsys.readouterr().err
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_stop_that_python_dropped_comes_again(handlers):
+    class Finaliser:
+        def __del__(self):
+            signal.raise_signal(signal.SIGINT)
+
+    def work():
+        Finaliser()
+        check_stopped()
+        return 0
+
+    assert stoppable(work, "") == EXIT_INTERRUPTED
+    assert stoppable(lambda: check_stopped() or 0, "") == 0  # and is forgotten then
