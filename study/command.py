@@ -133,15 +133,20 @@ def cannot_write(path: Path, error: OSError) -> str:
 
 def stoppable(work: Callable[[], int], command: str) -> int:
     """Do the work and return its exit code; Ctrl-C, or a batch system's SIGTERM, ends it with how to go on."""
-    _interrupts.pressed = False
-    for number in (signal.SIGINT, signal.SIGTERM):
-        if signal.getsignal(number) is not signal.SIG_IGN:  # as nohup and shells leave it for what they start behind
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    for number, handler in before.items():
+        if handler is not signal.SIG_IGN:  # as nohup and shells leave it for what they start behind
             signal.signal(number, _interrupts)
     try:
         return work()
     except KeyboardInterrupt:
         print(f"\nStopped. Nothing that was finished is lost. To go on: {command}", file=sys.stderr)
         return EXIT_INTERRUPTED
+    finally:
+        _interrupts.pressed = False
+        for number, handler in before.items():
+            if signal.getsignal(number) is _interrupts:  # else the work wants to be left alone until its end
+                signal.signal(number, handler)
 
 
 class _Interrupts:
