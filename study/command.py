@@ -213,11 +213,12 @@ def deaf_to_interrupts() -> Iterator[None]:
 
     What is born here stays deaf from its first moment; in this process a Ctrl-C waits for the end of the block.
     """
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    with unbroken():  # the mask is this thread's alone: another one may be given the signal
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            yield
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextmanager
