@@ -14,6 +14,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -213,6 +214,7 @@ def deaf_to_interrupts() -> Iterator[None]:
 
     What is born here stays deaf from its first moment; in this process a Ctrl-C waits for the end of the block.
     """
+    resource_tracker.ensure_running()  # its start, else the first thing a child's does, lifts the mask again
     with unbroken():  # the mask is this thread's alone: another one may be given the signal
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
