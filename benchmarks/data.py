@@ -29,12 +29,12 @@ import numpy as np
 
 from study.birdview import Renderer, valid_moments
 from study.config import IMAGE, StudySettings, frames_key, load_profile
-from study.cost import size
 from study.episode import read_episode, write_episode
 from study.provenance import ROOT, provenance
 from study.sim.autopilot import DT
 from study.sim.env import Traffic, make_traffic
 from study.sim.record import record_episode
+from study.stages import size
 
 RESULT = Path(__file__).parent / "results" / "data.json"
 PROFILE = "paper"

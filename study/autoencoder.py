@@ -48,12 +48,13 @@ from study.config import (
     BadInputError,
     EncoderSettings,
     FramesSettings,
+    TrainingDivergedError,
     one_of,
 )
-from study.cost import size
 from study.fitting import trainer
 from study.frames import Frames, epoch_order
-from study.result import Arrays, TrainingDivergedError
+from study.products import Arrays
+from study.stages import size
 
 Bytes = NDArray[np.uint8]
 Indices = NDArray[np.int64]
@@ -82,8 +83,7 @@ class _Convolution(nn.Conv2d):
 
     def forward(self, input: Tensor) -> Tensor:  # noqa: A002 - torch's name
         assert self.bias is not None
-        output: Tensor = self._conv_forward(input, self.weight, self.bias.detach())
-        return output
+        return functional.conv2d(input, self.weight, self.bias.detach(), self.stride)
 
 
 class _SubPixel(torch.autograd.Function):

@@ -1,128 +1,284 @@
 """The main path of one cell: a trained encoder, its latents, the policies on them, one CellResult.
 
-Knows no tracker and no queue. What is trained is kept under `scratch` by key until the cell is committed, so that a
-killed cell goes on where it was.
+`cell_flow` is the path; the functions below it are its stages, which run wherever an engine puts them. Nothing here
+knows a tracker. Products of finished stages are kept under `scratch` by key, so that a killed sweep resumes.
 """
 
 from __future__ import annotations
 
+import math
 import resource
 import time
-from collections.abc import Callable
-from typing import Any, Literal
+from collections.abc import Callable, Generator
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
-import torch
 from numpy.typing import NDArray
 
-from study.autoencoder import TrainedEncoder, check_device, encode, train_encoder
-from study.config import CEILING, BadInputError, cell_key, encoder_key
-from study.exported import export_driver
+from study.config import CEILING, BadInputError, cell_key
+from study.data import data_flow
+from study.engine.flows import run_flow
 from study.frames import Frames, FrameStore, open_frames
-from study.policy import train_policies
+from study.products import Arrays, read_product, write_product
 from study.provenance import provenance
-from study.result import NETWORK, NO_SEED, CellJob, CellResult
-from study.state import true_state
+from study.result import NO_SEED, CellJob, CellResult
+from study.stages import ENCODER, LATENTS, POLICY, RESULT, Batch, Flow, Task, Work
 
 PROBED = ("speed", "light", "lead_gap")  # columns of the labels that reports probe the latents for
+SHARE_SECONDS = 40.0  # on one core of the reference machine, of a share of the policies: what a kill costs at most
+HEAD = "product.json"
+ENCODER_CURVES = ["split", "epoch", "metric", "value"]  # columns
 
-Log = Callable[[str, int, dict[str, float]], None]
-Progress = Callable[[str, int, int], None]
+Report = Callable[..., None]
 
 
-def run_cell(job: CellJob, log: Log, progress: Progress) -> CellResult:
-    """Train the cell's encoder, encode the policy set once, train all policies, and save the result.
+@dataclass(frozen=True)
+class Product:
+    """What the encoder stage, or the policy stage for some seeds, leaves behind: arrays, curves and facts.
 
-    The ceiling has no encoder: its latents are the true state.
-
-    `log(stage, epoch, metrics)` once an epoch with names such as "test/loss_rec"; `progress(stage, done, total)`.
-    Raises BadInputError for settings that cannot be met, TrainingDivergedError for a loss that is not finite.
+    Encoder: parts "weights" and "samples". Policies: "weights" and "predictions". `facts`: plain values.
     """
-    store = open_frames(job.frames)
+
+    parts: dict[str, Arrays]
+    curves: pd.DataFrame
+    facts: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Latents:
+    """The policy set as policies see it: z [N, 64] float32 and labels of both splits, and what the stage says."""
+
+    z_train: NDArray[np.float32]
+    z_test: NDArray[np.float32]
+    labels_train: pd.DataFrame
+    labels_test: pd.DataFrame
+    facts: dict[str, Any]
+
+
+def cell_flow(job: CellJob, *, one_share: bool = False) -> Flow[tuple[CellResult, bytes]]:
+    """Train the cell's encoder, encode the policy set, train its policies in shares, and put the result together.
+
+    The ceiling has no encoder: its latents are the true state. With `one_share` all policies are trained at once, as
+    a GPU does best. Returns the result and its network, an archive of torch.export, empty for the ceiling.
+    """
+    encoder = None
+    if job.cell.heads != CEILING:
+        kept = job.scratch / "products" / f"encoder-{ENCODER.key(_work(job))}"
+        task = Task(ENCODER, train_cell_encoder, (job,), reports=True, accelerated=True)
+        (encoder,) = yield from _keep_all([kept], ("weights", "samples"), [task])
+    (latents,) = yield Batch([Task(LATENTS, encode_policy_set, (job, encoder), accelerated=True)])
+
+    shares = 1 if one_share else min(job.policy_seeds, math.ceil(2 * POLICY.cost(_work(job)) / SHARE_SECONDS))
+    tasks, paths = [], []
+    for part in np.array_split(np.arange(job.policy_seeds), shares):
+        seeds = part.tolist()
+        paths.append(job.scratch / "products" / f"policies-{job.key}-{seeds[0]}-{seeds[-1]}")
+        share = (job, latents, seeds)
+        tasks.append(Task(POLICY, train_policy_share, share, len(seeds), reports=True, accelerated=True))
+    policies = yield from _keep_all(paths, ("weights", "predictions"), tasks)
+    result: tuple[CellResult, bytes]
+    (result,) = yield Batch([Task(RESULT, assemble_result, (job, encoder, latents, policies))])
+    return result
+
+
+def product_folders(scratch: Path, key: str) -> list[Path]:
+    """Return the kept policies of a cell: once it is committed, nobody needs them."""
+    return list((scratch / "products").glob(f"policies-{key}-*"))
+
+
+def _work(job: CellJob) -> Work:
+    return Work(job.settings, job.cell, job.policy_seeds, job.frames.name)
+
+
+def _keep_all(
+    folders: list[Path], parts: tuple[str, ...], tasks: list[Task]
+) -> Generator[Batch, list[Any], list[Product]]:
+    """Return the products in these folders; those that are missing or damaged are made by their tasks, and kept."""
+    products: dict[int, Product] = {}
+    for index, folder in enumerate(folders):
+        with suppress(BadInputError):
+            head, arrays, curves = read_product(folder, HEAD, parts)
+            products[index] = Product(arrays, curves, head["facts"])
+    missing = [index for index in range(len(folders)) if index not in products]
+    if missing:
+        before = sum(tasks[index].weight for index in products)
+        made = yield Batch([tasks[index] for index in missing], before)
+        for index, product in zip(missing, made, strict=True):
+            write_product(folders[index], HEAD, {"facts": product.facts}, product.parts, product.curves)
+            products[index] = product
+    return [products[index] for index in range(len(folders))]
+
+
+# --- the stages -----------------------------------------------------------------------------------------------------
+# Each imports what it computes with when it runs: the process that only plans and commits needs no torch.
+
+
+def train_cell_encoder(job: CellJob, report: Report) -> Product:
+    """Train the encoder. Raises BadInputError for settings that cannot be met, TrainingDivergedError for a bad loss."""
+    from study.autoencoder import train_encoder  # noqa: PLC0415
+
+    store, device, facts = _begin(job, report)
     settings, cell = job.settings, job.cell
-    if cell_key(settings, cell, job.policy_seeds, store.key) != job.key:
-        raise BadInputError(
-            f"{job.frames} is not the frame store that {cell.label} was planned on; plan the sweep again"
-        )
-    device = choose_device(job)
-    torch.set_num_threads(job.threads)
-    # Now, not at the end: the code that runs is the one that was loaded, whatever is edited meanwhile.
-    origin = provenance() | {"determinism": determinism(), "seeds": _seeds(job)}
+    trained = train_encoder(
+        store.encoder,
+        cell.heads,
+        cell.fraction,
+        cell.encoder_seed,
+        settings.encoder,
+        settings.frames,
+        device=device,
+        checkpoint=job.scratch / "encoders" / ENCODER.key(_work(job)),
+        log=lambda epoch, metrics: report("log", epoch, metrics),
+        progress=lambda done, total: report("progress", done, total),
+    )
+    facts |= {"frames": trained.frames, "precision": trained.precision, "peak_bytes": _peak_bytes()}
+    return Product(
+        {"weights": trained.weights, "samples": trained.samples}, trained.curves, facts | {"seconds": trained.seconds}
+    )
+
+
+def encode_policy_set(job: CellJob, encoder: Product | None) -> Latents:
+    """Return the latents of the policy set: the encoder's, or the true state."""
+    from study.autoencoder import encode  # noqa: PLC0415
+    from study.state import true_state  # noqa: PLC0415
 
     started = time.perf_counter()
-    train, test = _labelled(store.policy, "train"), _labelled(store.policy, "test")
-    encoder = _NO_ENCODER if cell.heads == CEILING else _train_encoder(job, store, device, log, progress)
-    trained = time.perf_counter()
-    if cell.heads == CEILING:
-        state = true_state(store.policy.labels, store.manifest["sources"]["policy"], job.drives)
-        z_train, z_test = (state[indices] for indices, _ in (train, test))
+    store, device, facts = _begin(job)
+    policy = store.policy
+    rows = {split: policy.indices(split) for split in ("train", "test")}
+    if encoder is None:
+        state = true_state(policy.labels, store.manifest["sources"]["policy"], job.drives)
+        z = {split: state[indices] for split, indices in rows.items()}
     else:
-        z_train, z_test = (
-            encode(encoder.weights, store.policy.images, indices, device=device) for indices, _ in (train, test)
-        )
-    encoded = time.perf_counter()
+        weights = encoder.parts["weights"]
+        z = {split: encode(weights, policy.images, indices, device=device) for split, indices in rows.items()}
+    facts |= {"encoder_test": len(store.encoder.indices("test")), "peak_bytes": _peak_bytes()}
+    facts |= {"seconds": time.perf_counter() - started}
+    return Latents(z["train"], z["test"], _labels(policy, rows["train"]), _labels(policy, rows["test"]), facts)
 
-    policies = train_policies(
-        z_train,
-        z_test,
-        train[1],
-        test[1],
-        range(job.policy_seeds),
-        settings.policy,
+
+def train_policy_share(job: CellJob, latents: Latents, seeds: list[int], report: Report) -> Product:
+    """Train the policies of these seeds."""
+    from study.policy import train_policies  # noqa: PLC0415
+
+    device = _compute_on(job, report)
+    trained = train_policies(
+        latents.z_train,
+        latents.z_test,
+        latents.labels_train,
+        latents.labels_test,
+        seeds,
+        job.settings.policy,
         device=device,
-        log=lambda epoch, metrics: log("policy", epoch, metrics),
-        progress=lambda done, whole: progress("policy", done, whole),
+        log=lambda epoch, metrics: report("log", epoch, metrics),
+        progress=lambda done, total: report("progress", done, total),
     )
-    ended = time.perf_counter()
+    predictions: Arrays = {"acceleration": trained.acceleration, "steering": trained.steering}
+    facts = {"seconds": trained.seconds, "peak_bytes": _peak_bytes()}
+    return Product({"weights": trained.weights, "predictions": predictions}, trained.curves, facts)
 
-    labels = test[1]
+
+def assemble_result(
+    job: CellJob, encoder: Product | None, latents: Latents, policies: list[Product]
+) -> tuple[CellResult, bytes]:
+    """Return the result of the cell and its exported network."""
+    from study.exported import export_driver  # noqa: PLC0415
+    from study.policy import TrainedPolicies, join_policies  # noqa: PLC0415
+
+    joined = join_policies(
+        [
+            TrainedPolicies(p.parts["weights"], p.curves, **p.parts["predictions"], seconds=p.facts["seconds"])
+            for p in policies
+        ]
+    )
+    encoder_curves = joined.curves[ENCODER_CURVES][:0] if encoder is None else encoder.curves
+    curves = pd.concat([encoder_curves.assign(policy_seed=NO_SEED, stage="encoder"), joined.curves], ignore_index=True)
+    labels, first = latents.labels_test, (encoder or latents).facts
+    seconds: dict[str, float] = {
+        "encoder": encoder.facts["seconds"] if encoder else 0.0,
+        "encode": latents.facts["seconds"],
+        "policies": joined.seconds,
+    }
     result = CellResult(
-        cell=cell,
+        cell=job.cell,
         key=job.key,
-        settings=settings.model_dump(mode="json") | {"policy_seeds": job.policy_seeds, "frames_key": store.key},
-        curves=pd.concat(
-            [encoder.curves.assign(policy_seed=NO_SEED, stage="encoder"), policies.curves], ignore_index=True
-        ),
-        encoder=encoder.weights,
-        policies=policies.weights,
-        samples=encoder.samples,
+        settings=job.settings.model_dump(mode="json")
+        | {"policy_seeds": job.policy_seeds, "frames_key": job.frames.name},
+        curves=curves,
+        encoder=encoder.parts["weights"] if encoder else {},
+        policies=joined.weights,
+        samples=encoder.parts["samples"] if encoder else {},
         predictions={
-            "acceleration": policies.acceleration,
-            "steering": policies.steering,
+            "acceleration": joined.acceleration,
+            "steering": joined.steering,
             "acceleration_label": labels["acceleration"].to_numpy(np.uint8),
             "steering_label": labels["steering"].to_numpy(np.float32),
             "episode": labels["episode"].to_numpy(np.int32),
             **{name: labels[name].to_numpy() for name in PROBED},
-            "z": z_test,
+            "z": latents.z_test,
         },
         facts={
             "floor": float(np.bincount(labels["acceleration"]).max() / len(labels)),
             "frames": {
-                "encoder_train": encoder.frames,
-                "encoder_test": len(store.encoder.indices("test")),
-                "policy_train": len(train[1]),
+                "encoder_train": encoder.facts["frames"] if encoder else 0,
+                "encoder_test": latents.facts["encoder_test"],
+                "policy_train": len(latents.labels_train),
                 "policy_test": len(labels),
             },
-            "seconds": {
-                "encoder": encoder.seconds,
-                "encode": encoded - trained,
-                "policies": ended - encoded,
-                "cell": ended - started,
-            },
-            "peak_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
-            "device": device_name(device),
-            "precision": encoder.precision,
+            "seconds": seconds | {"cell": sum(seconds.values())},
+            "peak_bytes": max(part.facts["peak_bytes"] for part in (encoder or latents, latents, *policies)),
+            "device": first["device"],
+            "precision": encoder.facts["precision"] if encoder else "fp32",
             "threads": job.threads,
-            "provenance": origin,
+            "provenance": first["provenance"],
         },
     )
-    result.save(job.result_folder, lambda folder: export_driver(result, folder / NETWORK) if result.encoder else None)
-    return result
+    return result, export_driver(result) if encoder else b""
+
+
+# --- what the stages share ------------------------------------------------------------------------------------------
+
+
+def _begin(job: CellJob, report: Report | None = None) -> tuple[FrameStore, str, dict[str, Any]]:
+    """Return the frames, made here where they are missing, the device, and facts about what computes."""
+    device = _compute_on(job, report)
+    # Now, not at the end: the code that runs is the one that was loaded, whatever is edited meanwhile.
+    origin = provenance() | {"determinism": determinism(), "seeds": _seeds(job)}
+    if not (job.frames / "manifest.json").is_file():
+        run_flow(data_flow(job.settings, job.scratch, job.imported))
+    store = open_frames(job.frames)
+    if cell_key(job.settings, job.cell, job.policy_seeds, store.key) != job.key:
+        raise BadInputError(
+            f"{job.frames} is not the frame store that {job.cell.label} was planned on; plan the sweep again"
+        )
+    return store, device, {"device": device_name(device), "provenance": origin}
+
+
+def _compute_on(job: CellJob, report: Report | None) -> str:
+    """Set the threads, and return the device. Raises BadInputError for one that is not there."""
+    import torch  # noqa: PLC0415
+
+    from study.autoencoder import check_device  # noqa: PLC0415
+
+    torch.set_num_threads(job.threads)
+    device = job.device
+    if device in {"auto", "cuda"} or (device.startswith("cuda") and torch.cuda.device_count() == 1):
+        # A worker of an engine sees the one GPU that is its own, under the number 0.
+        device = "cuda:0" if torch.cuda.is_available() or device != "auto" else "cpu"
+    name = str(check_device(device))
+    if report:
+        report("device", device_name(name))
+    return name
 
 
 def determinism() -> dict[str, Any]:
-    """What torch has been told about speed against equal bits, and what it computes with on a CPU."""
+    """Return what torch has been told about speed against equal bits, and what it computes with on a CPU."""
+    import torch  # noqa: PLC0415
+
     cudnn, cuda = torch.backends.cudnn, torch.backends.cuda
     return {
         "deterministic_algorithms": torch.are_deterministic_algorithms_enabled(),
@@ -135,6 +291,13 @@ def determinism() -> dict[str, Any]:
     }
 
 
+def device_name(device: str) -> str:
+    """Return what a reader should know the device as."""
+    import torch  # noqa: PLC0415
+
+    return torch.cuda.get_device_name(device) if device.startswith("cuda") else "CPU"
+
+
 def _seeds(job: CellJob) -> dict[str, Any]:
     return {
         "recording": job.settings.recording.seed,
@@ -144,42 +307,10 @@ def _seeds(job: CellJob) -> dict[str, Any]:
     }
 
 
-_NO_ENCODER = TrainedEncoder({}, pd.DataFrame(columns=["split", "epoch", "metric", "value"]), {}, 0, 0.0, "fp32")
+def _labels(frames: Frames, rows: NDArray[np.int64]) -> pd.DataFrame:
+    return frames.labels.iloc[rows].reset_index(drop=True)
 
 
-def _train_encoder(job: CellJob, store: FrameStore, device: str, log: Log, progress: Progress) -> TrainedEncoder:
-    settings, cell = job.settings, job.cell
-    return train_encoder(
-        store.encoder,
-        cell.heads,
-        cell.fraction,
-        cell.encoder_seed,
-        settings.encoder,
-        settings.frames,
-        device=device,
-        checkpoint=job.scratch / "encoders" / encoder_key(settings, cell, store.key),
-        log=lambda epoch, metrics: log("encoder", epoch, metrics),
-        progress=lambda done, whole: progress("encoder", done, whole),
-    )
-
-
-def choose_device(job: CellJob) -> str:
-    """The torch device for a job. Raises BadInputError for one that is not there."""
-    return str(check_device(slot_device(job.device, job.slot, torch.cuda.device_count())))
-
-
-def slot_device(device: str, slot: int, gpus: int) -> str:
-    """The device of the worker in a slot: GPUs go round, unless one is named; "auto" is the CPU where there is none."""
-    if device == "auto" and not gpus:
-        return "cpu"
-    return f"cuda:{slot % gpus}" if gpus and device in {"auto", "cuda"} else device
-
-
-def device_name(device: str) -> str:
-    """What a reader should know the device as."""
-    return torch.cuda.get_device_name(device) if device.startswith("cuda") else "CPU"
-
-
-def _labelled(frames: Frames, split: Literal["train", "test"]) -> tuple[NDArray[np.int64], pd.DataFrame]:
-    indices = frames.indices(split)
-    return indices, frames.labels.iloc[indices].reset_index(drop=True)
+def _peak_bytes() -> int:
+    """Return the most memory that this process has held so far."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

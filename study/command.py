@@ -5,16 +5,12 @@ from __future__ import annotations
 import argparse
 import difflib
 import errno
-import fcntl
-import multiprocessing
 import os
 import shlex
 import signal
 import sys
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -40,7 +36,7 @@ class Parser(argparse.ArgumentParser):
         """Parse, or exit with code 2 and a message."""
         known, unknown = self.parse_known_args(args)
         if unknown:
-            options = [option for action in self._actions for option in action.option_strings]
+            options = [word for word in self.format_help().split() if word.startswith("--")]
             near = difflib.get_close_matches(unknown[0].split("=")[0], options, n=1, cutoff=0.5)
             hint = f"; did you mean {near[0]}?" if near else ""
             self.error(f"unknown setting or word '{unknown[0]}'{hint}")
@@ -121,6 +117,10 @@ def run(main: Callable[[Sequence[str]], int]) -> NoReturn:
     except BrokenPipeError:  # the reader, such as `head`, has seen enough
         sys.stderr.close()
         code = 0
+    if _interrupts.stopped:  # at once: Dask would wait for its workers, which end by themselves
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
     sys.exit(code)
 
 
@@ -141,6 +141,7 @@ def stoppable(work: Callable[[], int], command: str) -> int:
     try:
         return work()
     except KeyboardInterrupt:
+        _interrupts.stopped = True
         print(f"\nStopped. Nothing that was finished is lost. To go on: {command}", file=sys.stderr)
         return EXIT_INTERRUPTED
     finally:
@@ -154,6 +155,7 @@ class _Interrupts:
     """A signal handler that remembers, and raises KeyboardInterrupt unless it is held."""
 
     pressed = False
+    stopped = False  # a command has ended by it
     held = 0
 
     def __call__(self, *_: object) -> None:
@@ -190,45 +192,3 @@ def check_stopped() -> None:
 def typed(module: str, args: Sequence[str]) -> str:
     """The command line again, for people, without credentials."""
     return masked(shlex.join(["python", "-m", module, *args]))
-
-
-def obey_parent() -> None:
-    """In a child process: leave Ctrl-C to the parent, and end when the parent has been killed.
-
-    A child that works on would have nobody to take what it makes.
-    """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
-
-    def watch() -> None:
-        if parent is not None:
-            parent.join()
-            os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
-@contextmanager
-def deaf_to_interrupts() -> Iterator[None]:
-    """Start child processes in here: Ctrl-C reaches every process of a terminal, and is the parent's to answer.
-
-    What is born here stays deaf from its first moment; in this process a Ctrl-C waits for the end of the block.
-    """
-    resource_tracker.ensure_running()  # its start, else the first thing a child's does, lifts the mask again
-    with unbroken():  # the mask is this thread's alone: another one may be given the signal
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        try:
-            yield
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-@contextmanager
-def alone(lock: Path) -> Iterator[None]:
-    """Hold a lock file, after whoever holds it now; a process that dies lets go of it.
-
-    The file stays: were it removed, two processes could hold two files of that name.
-    """
-    with lock.open("w") as stream:
-        fcntl.flock(stream, fcntl.LOCK_EX)
-        yield

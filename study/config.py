@@ -46,6 +46,10 @@ class BadInputError(Exception):
     """
 
 
+class TrainingDivergedError(RuntimeError):
+    """A loss became infinite or no number: the cell has failed, and trying again would not help."""
+
+
 def one_of(what: str, got: object, allowed: object) -> BadInputError:
     """Error for a name that is not among the allowed ones."""
     names = ", ".join(str(name) for name in allowed)  # type: ignore[attr-defined]
@@ -365,9 +369,6 @@ def parameter_counts() -> dict[str, int]:
 
 SWEEPS = Path("sweeps")
 DEFAULT_TRACKING = "sqlite:///mlruns/mlflow.db"
-DEFAULT_QUEUE = "sqlite:///mlruns/queue.db"
-SHARED_QUEUES = ("postgresql://", "postgresql+psycopg://", "postgresql+psycopg2://")  # else SQLite, on one machine
-DEFAULT_GRACE = 90.0  # [s] without a sign of life after which a worker of a shared queue counts as dead
 
 
 def read_yaml(path: Path) -> dict[str, Any]:

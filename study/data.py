@@ -14,8 +14,9 @@ from __future__ import annotations
 import argparse
 import shutil
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from study.command import Parser, add_options, run, study_overrides
 from study.config import (
@@ -28,14 +29,16 @@ from study.config import (
     named_files,
     recording_key,
 )
-from study.cost import data_cost, recording_cost, size
+from study.display import Display
+from study.engine.flows import run_flow
 from study.imported import Imported, describe, import_drives, open_import
 from study.provenance import cores
+from study.stages import Flow, data_cost, recording_cost, size
 
 DATA = Path("data")
 POLICY_SEED = 1_000_000  # the policy set's drives are numbered from here: never those of the encoder set (Sec. V-A)
 
-Progress = Callable[[str, int, int], None]
+Described = tuple[dict[str, Any], dict[str, bytes]]  # a manifest, and files by name
 
 
 def frames_folder(settings: StudySettings, root: Path = DATA, imported: Imported | None = None) -> Path:
@@ -48,18 +51,15 @@ def drives_folder(settings: StudySettings, root: Path = DATA, imported: Imported
     return imported.folder if imported else root / "episodes" / recording_key(settings)
 
 
-def prepare(
-    settings: StudySettings, root: Path, processes: int, progress: Progress, imported: Imported | None = None
-) -> Path:
-    """The frame store's folder, after recording and rendering whatever is missing.
+def data_flow(settings: StudySettings, root: Path = DATA, imported: Imported | None = None) -> Flow[Path]:
+    """Record and render whatever is missing; returns the frame store's folder.
 
-    `progress(stage, done, total)` with stage "record" (drives) or "render" (frames).
     A store that was damaged is made again from its drives, and is what it was. Raises BadInputError when the settings
     cannot be met, the disk is too small or an imported drive has changed.
     """
     folder = frames_folder(settings, root, imported)
     # Imported here: planning needs no arrays, and frames that exist can be studied on a machine without the simulator.
-    from study.frames import DamagedFramesError, build_frames, open_frames  # noqa: PLC0415
+    from study.frames import DamagedFramesError, frames_flow, open_frames  # noqa: PLC0415
 
     if (folder / "manifest.json").is_file():
         try:
@@ -77,24 +77,15 @@ def prepare(
         encoder_drives, policy_drives = imported.assign(settings.frames)
         imported.check()
     else:
-        drives = record(settings, root, processes, progress)
+        drives = yield from drives_flow(settings, root)
         split = settings.recording.encoder_episodes
         encoder_drives, policy_drives = drives[:split], drives[split:]
-    build_frames(
-        settings.frames,
-        settings.birdview,
-        encoder_drives,
-        policy_drives,
-        folder,
-        processes,
-        lambda stage, done, whole: progress(stage, done, whole) if stage == "render" else None,
-        key=folder.name,
-    )
+    yield from frames_flow(settings.frames, settings.birdview, encoder_drives, policy_drives, folder, key=folder.name)
     return folder
 
 
-def record(settings: StudySettings, root: Path, processes: int, progress: Progress) -> list[Path]:
-    """The drives of our town, after recording those that are missing; the simulator is loaded for these only.
+def drives_flow(settings: StudySettings, root: Path = DATA) -> Flow[list[Path]]:
+    """Record the drives of our town that are missing, and return all; the simulator is loaded for these only.
 
     Raises BadInputError when the settings cannot be met, or when drives are missing where there is no simulator.
     """
@@ -107,19 +98,28 @@ def record(settings: StudySettings, root: Path, processes: int, progress: Progre
     paths = [folder / drive_name(seed) for seed in seeds]
     missing = sum(not path.exists() for path in paths)
     if not missing:
-        progress("record", len(paths), len(paths))
         return paths
     try:
-        from study.sim.record import record_all  # noqa: PLC0415
+        from study.sim.record import record_flow  # noqa: PLC0415
     except ModuleNotFoundError as error:
         raise BadInputError(
             f"{missing} of {len(paths)} drives are missing in {folder}, and {error.name}, which records them, is not "
             "installed here: run 'python -m study.data record' elsewhere with the same settings, and copy the folder"
         ) from error
     _check_room(root, recording_cost(settings).bytes, [folder])
-    return record_all(
-        settings.town, recording, seeds, folder, processes, lambda done, whole: progress("record", done, whole)
-    )
+    return (yield from record_flow(settings.town, recording, seeds, folder))
+
+
+def describe_data(folder: Path, drives: Path, settings: StudySettings, imported: Imported | None) -> Described:
+    """Return the manifest of the frame store and the files of its data card by name; makes what is missing."""
+    from study.card import card_files, source_drives  # noqa: PLC0415 - pictures, which training needs not
+    from study.frames import open_frames  # noqa: PLC0415
+
+    if not (folder / "manifest.json").is_file():
+        run_flow(data_flow(settings, DATA, imported))
+    store = open_frames(folder)
+    files = card_files(store, source_drives(store, drives), folder)
+    return store.manifest, {path.name: path.read_bytes() for path in files}
 
 
 def _check_room(root: Path, need: int, taken: Sequence[Path]) -> None:
@@ -174,7 +174,7 @@ def parser() -> Parser:
     made.add_argument(
         "--data", type=Path, metavar="FOLDER", help="imported drives (study.data import); default: our town's"
     )
-    made.add_argument("--processes", type=int, default=cores(), metavar="N", help="default: all cores")
+    made.add_argument("--workers", type=int, default=cores(), metavar="N", help="processes (default: all cores)")
     add_options(made, StudySettings)
     return made
 
@@ -199,24 +199,31 @@ def main(args: Sequence[str]) -> int:
         print(folder)
         return 0
     settings = load_profile(options.profile, study_overrides(options))
-    if options.processes < 1:
-        raise BadInputError(f"--processes is {options.processes}; it must be 1 or more")
+    if options.workers < 1:
+        raise BadInputError(f"--workers is {options.workers}; it must be 1 or more")
     imported = open_import(options.data) if options.data else None
-    from study.display import Display  # noqa: PLC0415
-
     if options.action == "record":
         if imported:
             raise BadInputError(f"record: the drives in {options.data} are recorded already; leave out --data")
         with Display(f"drives ({options.profile})", {}, {}, recording_cost(settings).seconds) as display:
-            print(record(settings, DATA, options.processes, display.data)[0].parent)
+            print(_make(drives_flow(settings), options.workers, display)[0].parent)
         return 0
     expected = data_cost(settings, recorded=imported is None)
     with Display(f"data ({options.profile})", {}, {}, expected.seconds) as display:
-        folder = prepare(settings, DATA, options.processes, display.data, imported)
+        folder = _make(data_flow(settings, DATA, imported), options.workers, display)
     print(folder)
     if options.action != "build":
         _show(options.action, folder, drives_folder(settings, DATA, imported))
     return 0
+
+
+def _make(flow: Flow[Any], workers: int, display: Display) -> Any:
+    from study.engine.cluster import local_engine  # noqa: PLC0415 - Dask, which --help does not need
+
+    if workers == 1:
+        return run_flow(flow, progress=display.data)
+    with local_engine(workers, DATA / "tmp") as engine:
+        return run_flow(flow, engine, display.data)
 
 
 def _show(action: str, folder: Path, drives_at: Path) -> None:

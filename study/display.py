@@ -7,18 +7,16 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Self
 
-from study.cost import clock
+from study.stages import CELL_STAGES, STAGES, Work, clock, share_done
 
 if TYPE_CHECKING:  # plain lines need no rich, and a machine that only trains may lack it
     from rich.live import Live
     from rich.table import Table
 
 LINE_EVERY = 15.0  # [s] between two plain lines
-STAGES = {"record": "recording drives", "render": "rendering frames", "encoder": "encoder", "policy": "policies"}
-UNITS = {"record": "drive", "render": "frame", "encoder": "step", "policy": "epoch"}
-ENCODER_SHARE = 0.8  # of a cell's time, where the two stages are not told apart beforehand
-RECORD_SHARE = 0.8  # of the data's time, likewise
 DATA_KEY = ""
+RECORD_SHARE = 0.8  # of the data's time, where the stages are not told apart beforehand
+DATA_SHARES = {"record": RECORD_SHARE, "render": 1 - RECORD_SHARE}
 
 
 def show_table(rows: Sequence[Sequence[str]], styles: Sequence[str]) -> None:
@@ -44,8 +42,16 @@ class Display:
     Times left are the expected ones times what the elapsed ones have shown them to be wrong by.
     """
 
-    def __init__(self, title: str, costs: Mapping[str, float], labels: Mapping[str, str], data_cost: float) -> None:
+    def __init__(
+        self,
+        title: str,
+        costs: Mapping[str, float],
+        labels: Mapping[str, str],
+        data_cost: float,
+        works: Mapping[str, Work] | None = None,
+    ) -> None:
         self._title, self._labels = title, labels
+        self._works = works or {}
         self._costs = {DATA_KEY: data_cost, **costs}
         self._shares = dict.fromkeys(self._costs, 0.0)  # of the cell's time, done
         self._state: dict[str, str] = {}  # of what runs now
@@ -69,8 +75,7 @@ class Display:
 
     def data(self, stage: str, done: int, whole: int) -> None:
         """The data stage has come this far; what was there when it began does not count as speed."""
-        share = done / max(whole, 1)
-        share = RECORD_SHARE * share if stage == "record" else RECORD_SHARE + (1 - RECORD_SHARE) * share
+        share = RECORD_SHARE * (stage != "record") + done / max(whole, 1) * DATA_SHARES.get(stage, 0.0)
         now = time.monotonic()
         if stage not in self._data_since:
             self._data_since[stage] = (now, done)
@@ -79,8 +84,8 @@ class Display:
         began, there = self._data_since[stage]
         rate = (done - there) / (now - began) if now > began else 0.0
         said = f", {rate:,.0f}/s" if rate >= 100 else f", {rate:.2g}/s" if rate else ""
-        self._state[DATA_KEY] = f"{STAGES[stage]} {done:,}/{whole:,}{said}"
-        if stage == "render" and done == whole:
+        self._state[DATA_KEY] = f"{STAGES[stage].activity} {done:,}/{whole:,}{said}"
+        if stage == "describe" and done == whole:
             self._state.pop(DATA_KEY)
         self.tick()
 
@@ -92,11 +97,10 @@ class Display:
 
     def progress(self, key: str, stage: str, done: int, whole: int) -> None:
         """A cell has come this far in a stage."""
-        share = done / max(whole, 1)
-        before, part = (0.0, ENCODER_SHARE) if stage == "encoder" else (ENCODER_SHARE, 1 - ENCODER_SHARE)
-        self._shares[key] = before + part * share
+        kind = STAGES[stage]
+        self._shares[key] = share_done(CELL_STAGES, self._works[key], kind, done / max(whole, 1))
         self._resumed.setdefault(key, self._shares[key] if done > 1 else 0.0)
-        self._state[key] = f"{STAGES[stage]}, {UNITS[stage]} {done:,}/{whole:,}"
+        self._state[key] = f"{kind.activity}, {kind.unit} {done:,}/{whole:,}" if whole > 1 else kind.activity
         self.tick()
 
     def wait(self, key: str, why: str) -> None:

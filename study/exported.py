@@ -6,8 +6,8 @@ run, none of this program, and it cannot carry code; a pickled module, MLflow's 
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -53,11 +53,12 @@ class Driver(nn.Module):
         return {"steering": said["steering"][..., 0], "acceleration": said["acceleration"]}
 
 
-def export_driver(result: CellResult, file: Path) -> Path:
-    """Write the cell's Driver as a .pt2 file that takes batches of any size. About a second's work."""
+def export_driver(result: CellResult) -> bytes:
+    """Return the cell's Driver as a .pt2 archive that takes batches of any size. About a second's work."""
     driver = Driver(result.encoder, result.policies).eval()
     images = to_float(torch.from_numpy(result.samples["input"][:1])).repeat(2, 1, 1, 1)  # one would become a constant
     with torch.no_grad():
         program = torch.export.export(driver, (images,), dynamic_shapes=({0: torch.export.Dim.DYNAMIC},))
-    torch.export.save(program, file)
-    return file
+    archive = io.BytesIO()
+    torch.export.save(program, archive)
+    return archive.getvalue()

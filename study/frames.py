@@ -8,9 +8,9 @@ A store is a folder, written once and then only read:
     `masks.npy`             [N, 2, 512] uint8: pred and plan, 4096 bits each, see `unpack_masks`
     `labels.parquet`        one row for each frame, columns LABELS
 
-The main path is `build_frames`: every drive is read once for its candidate moments, the frames are chosen from all of
-them (`_choose`), then every drive's frames are painted into their rows of preallocated files. What is finished is
-journalled, so a build that was killed goes on, and ends with the same bytes whatever the number of processes.
+The main path is `frames_flow`: every drive is read once for its candidate moments, the frames are chosen from all of
+them (`choose`), then every drive's frames are painted into their rows of preallocated files. Each part that is painted
+leaves a note, so a build that was killed resumes, and ends with the same bytes wherever its tasks ran.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ import io
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
+from filelock import FileLock
 from numpy.typing import NDArray
 
 from study.birdview import MASK_BYTES, Renderer
-from study.command import WRITE_ERRORS, alone, cannot_write
 from study.config import (
     FORMAT_VERSIONS,
     IMAGE,
@@ -40,19 +40,18 @@ from study.config import (
     FramesSettings,
     content_key,
 )
-from study.cost import size
 from study.episode import episode_digest, file_digest, read_episode
-from study.pool import Pool
 from study.selection import LABELS, SETS, Columns, Indices, candidates, choose, histograms
+from study.stages import RENDER, SELECT, Batch, Flow, Task, size
 
 SCHEMA_VERSION = 1
 SHAPES = {"images": (IMAGE, IMAGE, 3), "masks": (2, MASK_BYTES)}
+PARTS = "parts"  # folder of the notes on what is painted
 CHUNK = 512  # frames painted before they are written: 7 MB
 
 # What a random generator is for; with a seed it makes the generator. `selection` has others.
 _SUBSET, _ORDER = 2, 3
 
-Progress = Callable[[str, int, int], None]
 Bytes = NDArray[np.uint8]
 
 
@@ -188,37 +187,28 @@ def _open_set(folder: Path, entry: dict[str, Any], *, check: bool) -> Frames:
 # --- building -------------------------------------------------------------------------------------------------------
 
 
-def build_frames(
+def frames_flow(
     frames: FramesSettings,
     birdview: BirdviewSettings,
     encoder_episodes: Sequence[Path],
     policy_episodes: Sequence[Path],
     folder: Path,
-    processes: int,
-    progress: Progress | None = None,
     *,
     key: str | None = None,
-) -> None:
+) -> Flow[None]:
     """Build the frame store `folder` from recorded drives; nothing happens when it is there already, and whole.
 
-    `key` names the store; by default it follows from the settings and the drives' digests. `progress(stage, done,
-    total)` with stage "select" (drives) or "render" (frames). A build that was killed goes on where it was.
-    Raises BadInputError when the drives give too few frames, serve both sets, are no Episodes, when the disk is too
-    small, or when `folder` holds something else.
+    `key` names the store; by default it follows from the settings and the drives' digests. A build that was killed
+    resumes. Raises BadInputError when the drives give too few frames, serve both sets, are no Episodes, when the disk
+    is too small, or when `folder` holds something else.
     """
     sources = {"encoder": _sources(encoder_episodes), "policy": _sources(policy_episodes)}
     _check_sources(sources)
     build = _Build(frames, birdview, {"encoder": encoder_episodes, "policy": policy_episodes}, sources, folder, key)
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with alone(folder.parent / ".lock"):
-            if not build.finished():
-                with Pool(processes) as pool:
-                    build.run(pool, progress or (lambda *_: None))
-    except OSError as error:
-        if error.errno not in WRITE_ERRORS:
-            raise
-        raise BadInputError(cannot_write(folder, error)) from error
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(folder.parent / ".lock"):
+        if not build.finished():
+            yield from build.flow()
 
 
 def _sources(paths: Sequence[Path]) -> list[dict[str, str]]:
@@ -280,10 +270,10 @@ class _Build:
             )
         return True
 
-    def run(self, pool: Pool, progress: Progress) -> None:
-        plan = self._plan(pool, progress)
+    def flow(self) -> Flow[None]:
+        plan = yield from self._plan()
         self._allocate(plan)
-        parts = self._render(pool, plan, progress)
+        parts = yield from self._render(plan)
         manifest = {
             "schema_version": SCHEMA_VERSION,
             "key": self.given_key or self.inputs,
@@ -307,11 +297,11 @@ class _Build:
             },
         }
         _write_json(self.draft / "manifest.json", manifest)
-        for left in ("plan.json", "journal"):
-            (self.draft / left).unlink()
+        (self.draft / "plan.json").unlink()
+        shutil.rmtree(self.draft / PARTS)
         self.draft.rename(self.folder)
 
-    def _plan(self, pool: Pool, progress: Progress) -> dict[str, Any]:
+    def _plan(self) -> Flow[dict[str, Any]]:
         """Choose the frames, or take up the choice of a build that was killed. The draft holds the labels then."""
         path = self.draft / "plan.json"
         if path.is_file():
@@ -324,15 +314,13 @@ class _Build:
         if self.draft.exists():
             shutil.rmtree(self.draft)
         self._check_room()
-        tasks = [
-            (path, number, name, self.frames, self.birdview)
-            for name in SETS
-            for number, path in enumerate(self.paths[name])
-        ]
-        tables: list[Columns] = [{}] * len(tasks)
-        for done, (number, table) in enumerate(pool.results(candidates, tasks)):
-            tables[number] = table
-            progress("select", done + 1, len(tasks))
+        tables: list[Columns] = yield Batch(
+            [
+                Task(SELECT, candidates, (path, number, name, self.frames, self.birdview))
+                for name in SETS
+                for number, path in enumerate(self.paths[name])
+            ]
+        )
         plan = {"inputs": self.inputs}
         first = 0
         for name, wanted in (("encoder", self.frames.encoder), ("policy", self.frames.policy)):
@@ -376,49 +364,33 @@ class _Build:
                 whole = (plan[name]["frames"], *shape)
                 length = _header(whole) + int(np.prod(whole))
                 if not (path.is_file() and path.stat().st_size == length):
-                    (self.draft / "journal").unlink(missing_ok=True)
+                    shutil.rmtree(self.draft / PARTS, ignore_errors=True)
                     np.lib.format.open_memmap(path, mode="w+", dtype=np.uint8, shape=whole)
                 with path.open("r+b") as stream:
                     os.posix_fallocate(stream.fileno(), 0, length)
 
-    def _render(self, pool: Pool, plan: dict[str, Any], progress: Progress) -> dict[str, list[dict[str, Any]]]:
-        parts: dict[str, dict[int, dict[str, Any]]] = {name: {} for name in SETS}
-        for line in _journal(self.draft / "journal"):
-            parts[line["set"]][line["start"]] = line["part"]
-        tasks: list[tuple[Any, ...]] = []
+    def _render(self, plan: dict[str, Any]) -> Flow[dict[str, list[dict[str, Any]]]]:
+        (self.draft / PARTS).mkdir(exist_ok=True)
+        tasks: list[Task] = []
+        notes: list[Path] = []
+        done = 0
         for name in SETS:
             labels = pd.read_parquet(self.draft / name / "labels.parquet")
             episode, step, agent = (labels[key].to_numpy() for key in ("episode", "step", "agent"))
             starts = np.flatnonzero(np.diff(episode, prepend=-1))
             for start, end in zip(starts.tolist(), [*starts[1:].tolist(), len(episode)], strict=True):
-                if start not in parts[name]:
-                    moments = np.stack([step[start:end], agent[start:end]], axis=1)
-                    task = (self.paths[name][episode[start]], self.birdview, moments, self.draft / name, start)
-                    tasks.append((*task, plan[name]["frames"]))
-        total = sum(plan[name]["frames"] for name in SETS)
-        done = sum(part["rows"] for name in SETS for part in parts[name].values())
-        progress("render", done, total)
-        with (self.draft / "journal").open("a") as journal:
-            for number, part in pool.results(_render_part, tasks):
-                name = tasks[number][3].name
-                parts[name][part["start"]] = part
-                journal.write(json.dumps({"set": name, "start": part["start"], "part": part}) + "\n")
-                journal.flush()
-                done += part["rows"]
-                progress("render", done, total)
-        return {name: [parts[name][start] for start in sorted(parts[name])] for name in SETS}
-
-
-def _journal(path: Path) -> Iterator[dict[str, Any]]:
-    """Finished parts; a line that a kill has cut off ends them."""
-    if not path.is_file():
-        return
-    whole = path.read_text(encoding="utf-8")
-    end = whole.rfind("\n") + 1
-    if end < len(whole):
-        os.truncate(path, end)
-    for line in whole[:end].splitlines():
-        yield json.loads(line)
+                notes.append(self.draft / PARTS / f"{name}-{start:09d}.json")
+                if notes[-1].is_file():
+                    done += end - start
+                    continue
+                moments = np.stack([step[start:end], agent[start:end]], axis=1)
+                part = (self.paths[name][episode[start]], self.birdview, moments, self.draft / name, start)
+                tasks.append(Task(RENDER, _render_part, (*part, plan[name]["frames"], notes[-1]), end - start))
+        yield Batch(tasks, done)
+        parts: dict[str, list[dict[str, Any]]] = {name: [] for name in SETS}
+        for note in notes:  # in the order of their rows
+            parts[note.name.partition("-")[0]].append(json.loads(note.read_text(encoding="utf-8")))
+        return parts
 
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:
@@ -438,9 +410,15 @@ def _header(shape: tuple[int, ...]) -> int:
 
 
 def _render_part(
-    path: Path, settings: BirdviewSettings, moments: NDArray[np.int32], folder: Path, start: int, frames: int
-) -> dict[str, Any]:
-    """Paint frames of one drive, [M, 2] of (step, agent id), into the rows from `start` on; runs in a worker."""
+    path: Path,
+    settings: BirdviewSettings,
+    moments: NDArray[np.int32],
+    folder: Path,
+    start: int,
+    frames: int,
+    note: Path,
+) -> None:
+    """Paint frames of one drive, [M, 2] of (step, agent id), into the rows from `start` on, and then note it."""
     episode = read_episode(path)
     positions = {agent.id: index for index, agent in enumerate(episode.agents)}
     where = np.array([(step, positions[agent]) for step, agent in moments.tolist()])
@@ -456,5 +434,6 @@ def _render_part(
                 digests[name].update(array.data)
         for stream in streams.values():
             stream.flush()
-            os.fsync(stream.fileno())  # the journal must not know of rows that a power cut takes back
-    return {"start": start, "rows": len(where)} | {name: digest.hexdigest() for name, digest in digests.items()}
+            os.fsync(stream.fileno())  # the note must not tell of rows that a power cut takes back
+    part = {"start": start, "rows": len(where)} | {name: digest.hexdigest() for name, digest in digests.items()}
+    _write_json(note, part)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from study.config import BadInputError
 from study.plan import Plan
 from study.provenance import provenance
-from study.result import NETWORK, CellResult, load_results
+from study.result import CellResult, load_results
 
 if TYPE_CHECKING:  # what is wrong with the results is told without MLflow
     from study.tracking import Tracker
@@ -38,7 +37,6 @@ def planned_results(plan: Plan, folder: Path) -> list[str]:
 def take_in(plan: Plan, folder: Path, keys: Sequence[str], tracker: Tracker) -> list[str]:
     """Commit the results of those keys, unless their cells are finished. Returns the keys that are still missing.
 
-    Where other machines work on the sweep just now, it stays theirs: its run is closed only when nothing is missing.
     Raises BadInputError when the frames' manifest beside the results is not theirs.
     """
     from study.exported import export_driver  # noqa: PLC0415 - torch, which a refusal does not need
@@ -46,9 +44,8 @@ def take_in(plan: Plan, folder: Path, keys: Sequence[str], tracker: Tracker) -> 
     data = _manifest(plan, folder)
     done = tracker.finished(list(plan.cells))
     planned = (plan.grid, plan.profile, plan.settings, plan.cells)
-    goes_on = tracker.runs_elsewhere(*planned)
     origin = provenance() | {"command": plan.command}
-    sweep_run = tracker.open_sweep(*planned, data, origin, join=goes_on)
+    sweep_run = tracker.open_sweep(*planned, data, origin)
     missing = list(plan.cells)
     try:
         for key in keys:
@@ -58,17 +55,15 @@ def take_in(plan: Plan, folder: Path, keys: Sequence[str], tracker: Tracker) -> 
             run = tracker.start_cell(sweep_run, plan.cells[key], key, plan.settings, plan.grid.policy_seeds)
             try:
                 result = CellResult.load(folder / key)
-                with tempfile.TemporaryDirectory() as name:  # made here, of the weights: no network comes from outside
-                    network = export_driver(result, Path(name) / NETWORK) if result.encoder else None
-                    done[key] = tracker.commit(run, result, network)
+                network = export_driver(result) if result.encoder else b""  # made here: none comes from outside
+                done[key] = tracker.commit(run, result, network)
             except BaseException:
                 tracker.interrupt(run)
                 raise
             _say(f"{plan.cells[key].label} ({key}): imported")
         missing = [key for key in plan.cells if key not in done]
     finally:
-        if not (missing and goes_on):
-            tracker.close_sweep(sweep_run, "KILLED" if missing else "FINISHED")
+        tracker.close_sweep(sweep_run, "KILLED" if missing else "FINISHED")
     return missing
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import tempfile
 from pathlib import Path
 
@@ -26,14 +25,14 @@ EXAMPLE = "input_example.json"
 DIGITS = 4  # of an example's numbers: two neighbouring colours are 0.0039 apart
 
 
-def write_model(folder: Path, result: CellResult, network: Path, run_id: str = "", model_id: str = "") -> None:
+def write_model(folder: Path, result: CellResult, network: bytes, run_id: str = "", model_id: str = "") -> None:
     """Make the folder that mlflow.pytorch.load_model reads; `network` is what study.exported has written.
 
     Its `pytorch` flavour is written here and not by mlflow.pytorch, which would load torch and export once more. There
     is no `python_function` flavour: MLflow's has room for one output, and this network has two.
     """
     (folder / DATA).mkdir(parents=True)
-    shutil.copyfile(network, folder / DATA / NETWORK)
+    (folder / DATA / NETWORK).write_bytes(network)
     example = np.round(result.samples["input"][:1].transpose(0, 3, 1, 2) / 255, DIGITS)
     (folder / EXAMPLE).write_text(json.dumps(example.tolist(), separators=(",", ":")), encoding="utf-8")
     version = str(result.facts.get("provenance", {}).get("packages", {}).get("torch", ""))
@@ -60,7 +59,7 @@ def write_model(folder: Path, result: CellResult, network: Path, run_id: str = "
     model.save(str(folder / "MLmodel"))
 
 
-def log_model(client: MlflowClient, experiment: str, run_id: str, result: CellResult, network: Path) -> str:
+def log_model(client: MlflowClient, experiment: str, run_id: str, result: CellResult, network: bytes) -> str:
     """Log the model of a cell run, or log it again where that broke off. Returns its id."""
     there = client.search_logged_models([experiment], f"source_run_id = '{run_id}'")
     if there:

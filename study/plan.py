@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,9 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 from study.command import GRID_OPTIONS, Parser, add_options, add_tracking_option, grid_overrides, study_overrides
 from study.config import (
-    DEFAULT_GRACE,
-    DEFAULT_QUEUE,
-    SHARED_QUEUES,
     SWEEPS,
     BadInputError,
     Cell,
@@ -29,10 +25,10 @@ from study.config import (
     merge,
     named_files,
 )
-from study.cost import Cost, data_cost
 from study.data import DATA, drives_folder, frames_folder
 from study.imported import Imported, open_import
-from study.provenance import usual_threads
+from study.result import CellJob
+from study.stages import Cost, Work, data_cost
 
 if TYPE_CHECKING:
     from study.tracking import Tracker
@@ -68,13 +64,18 @@ class Plan:
         return data_cost(self.settings, recorded=self.imported is None)
 
     @property
+    def works(self) -> dict[str, Work]:
+        """What the keys and costs of each cell's stages follow from."""
+        return {key: Work(self.settings, cell, self.grid.policy_seeds) for key, cell in self.cells.items()}
+
+    @property
     def key(self) -> str:
         """Key of the plan: the same cells under the same name."""
         return content_key("plan", {"sweep": self.grid.name, "profile": self.profile}, tuple(self.cells), 1)
 
     @property
-    def queue_name(self) -> str:
-        """Under which the plan's cells wait in a queue."""
+    def study_name(self) -> str:
+        """Name of the plan's Optuna study."""
         return f"{self.grid.name} {self.profile} {self.key}"
 
 
@@ -130,9 +131,9 @@ def add_machine_options(parser: Parser) -> None:
     parser.add_argument(
         "--threads",
         type=int,
-        default=usual_threads(),
+        default=1,
         metavar="N",
-        help="threads each cell computes with; with another number the last digits differ (default: %(default)s)",
+        help="threads each task computes with, for a lone large encoder; the last digits depend on it (default: 1)",
     )
 
 
@@ -144,16 +145,6 @@ def check_machine(options: argparse.Namespace) -> None:
         from study.autoencoder import check_device  # noqa: PLC0415 - loads torch, which only a named GPU needs here
 
         check_device(options.device)
-
-
-def thread_hint(workers: int, threads: int, there: int) -> str:
-    """What to say when there are more threads than cores: they wait for each other, and keep the cores busy with it."""
-    if threads == 1 or workers * threads <= there:
-        return ""
-    return (
-        f"{workers} workers with {threads} threads each hinder each other on {there} cores: give fewer --workers, or "
-        f"--threads {max(1, there // workers)}, whose results differ in their last digits"
-    )
 
 
 def given_plan(options: argparse.Namespace) -> Plan:
@@ -171,37 +162,41 @@ def look_up(tracking: str) -> Tracker | None:
     return Tracker.look(tracking)
 
 
-def add_run_options(parser: Parser, workers: str) -> None:
-    """What every command takes that trains the cells of a plan; `workers` says what --workers counts."""
-    parser.add_argument("--workers", type=int, default=1, metavar="N", help=f"{workers} (default: 1)")
+def cell_jobs(plan: Plan, device: str, threads: int) -> dict[str, CellJob]:
+    """Return what training each cell needs to know, by key."""
+    seeds, folders = plan.grid.policy_seeds, (plan.frames, plan.drives, DATA)
+    return {
+        key: CellJob(cell, key, plan.settings, seeds, *folders, device, threads, plan.imported)
+        for key, cell in plan.cells.items()
+    }
+
+
+def add_run_options(parser: Parser) -> None:
+    """Add the options of a command that trains the cells of a plan and commits them."""
+    parser.add_argument(
+        "--workers", type=int, metavar="N", help="processes on this machine, one task each (default: all cores)"
+    )
+    parser.add_argument(
+        "--cluster",
+        metavar="WHERE",
+        help="run on a Dask cluster: its scheduler's address (tls://host:8786), or a YAML file for a batch system",
+    )
+    parser.add_argument(
+        "--certificates", type=Path, metavar="DIR", help="with tls://: folder with ca.pem, cert.pem and key.pem"
+    )
     add_machine_options(parser)
     add_tracking_option(parser)
-    parser.add_argument(
-        "--queue",
-        default=os.environ.get("STUDY_QUEUE", DEFAULT_QUEUE),  # not in the help: it may hold a password
-        metavar="URI",
-        help=f"{SHARED_QUEUES[0]}user@host/database for many machines (default: STUDY_QUEUE, else {DEFAULT_QUEUE})",
-    )
-    parser.add_argument(
-        "--grace",
-        type=float,
-        default=DEFAULT_GRACE,
-        metavar="S",
-        help="shared queue: seconds without a sign of life until a worker's cell waits again (default: %(default)g)",
-    )
+    parser.add_argument("--wait", action="store_true", help="wait while another sweep runs on this tracking store")
     parser.add_argument("--retry-failed", action="store_true", help="try cells again that are listed as failed")
 
 
-def check_run_options(options: argparse.Namespace, fewest_workers: int = 1) -> None:
+def check_run_options(options: argparse.Namespace) -> None:
     """Raise BadInputError for options of `add_run_options` that cannot be used."""
-    shared = options.queue.startswith(SHARED_QUEUES)
-    if options.workers < fewest_workers:
-        raise BadInputError(f"--workers is {options.workers}; it must be {fewest_workers} or more")
-    if options.grace < 2:
-        raise BadInputError(f"--grace is {options.grace:g}; it must be 2 s or more")
-    if shared and options.tracking.startswith("sqlite"):
-        raise BadInputError(
-            "a shared queue needs a store that all its workers reach: --tracking http://host:port "
-            f"(got {options.tracking}; start one with: mlflow server)"
-        )
-    check_machine(options)
+    if options.workers is not None and options.workers < 1:
+        raise BadInputError(f"--workers is {options.workers}; it must be 1 or more")
+    if options.cluster and options.workers is not None:
+        raise BadInputError("--workers counts processes on this machine; a cluster has its own: leave one of them out")
+    if options.certificates and not (options.cluster or "").startswith("tls://"):
+        raise BadInputError("--certificates goes with --cluster tls://host:port")
+    if options.threads < 1 or (options.device not in {"auto", "cpu"} and not options.cluster):
+        check_machine(options)

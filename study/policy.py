@@ -2,11 +2,10 @@
 
 Two small networks with no weight in common learn from z: one gives the steering, one the logits of the three
 accelerations. The seeds never touch each other: the loss is their sum and Adam works number by number, so each seed
-becomes what it would have become alone. A unit of work is therefore one network on a group of seeds. On a CPU a group
-is one seed and its step fits into one core's cache. The seeds are shared out to processes, one for each thread that
-torch may use, and every process computes on one thread: results depend neither on the number of processes nor on the
-seeds beside. Threads in their place would hand the interpreter to each other at every call of torch, and gain nothing.
-On a GPU all seeds are one group, in this process.
+becomes what it would have become alone, whichever seeds are trained beside it and wherever: shares of the seeds can be
+trained by different processes, and `join_policies` puts them together. A unit of work is one network on a group of
+seeds. On a CPU a group is one seed, whose step fits into one core's cache, computed on one thread: threads inside an
+operation would wait for each other forty times a step. On a GPU all seeds are one group.
 
 Suffixes: S seeds, G seeds of a group, B rows of a batch, N frames, H hidden units, O outputs, Z = 64 latent numbers.
 """
@@ -16,17 +15,11 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-import multiprocessing
-import threading
 import time
-import traceback
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
-from multiprocessing.connection import Connection, wait
-from multiprocessing.process import BaseProcess
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import lightning
 import numpy as np
@@ -36,7 +29,6 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from study.command import deaf_to_interrupts, obey_parent
 from study.config import (
     ACCELERATION_HIDDEN,
     ACCELERATIONS,
@@ -45,10 +37,10 @@ from study.config import (
     STEERING_HIDDEN,
     BadInputError,
     PolicySettings,
+    TrainingDivergedError,
 )
 from study.fitting import trainer
-from study.provenance import cores
-from study.result import CURVE_COLUMNS, TrainingDivergedError
+from study.result import CURVE_COLUMNS
 
 Log = Callable[[int, dict[str, float]], None]
 Progress = Callable[[int, int], None]
@@ -62,6 +54,7 @@ WIDTHS = {
 }
 METRICS = ("steering_loss", "acceleration_accuracy", "balanced_accuracy", "cross_entropy")
 SPLITS = ("train", "test")
+_ORDER = {"split": SPLITS, "metric": METRICS}  # of the rows of an epoch's curves
 
 _INIT, _EPOCH, _SUBSET = range(3)  # purposes of random numbers
 _WORD = 32  # random bits in an int32
@@ -70,7 +63,6 @@ _VECTOR = 16  # float32 in the widest register
 _DROPPED = -1e30  # takes a unit below zero, where the ReLU ends it
 _KEPT = 1 / (1 - DROPOUT)
 _ROWS = 2048  # evaluated at once: their hidden units fit into a core's cache
-_WORTH = 4_000_000  # frames that all seeds see, 15 s: a process takes 4 s of them to load torch
 
 assert DROPOUT == 0.5, "masks are made of random bits"
 
@@ -475,152 +467,6 @@ def _acceleration_gradient(logits: Tensor, labels: Tensor) -> Tensor:
     return gradient.div_(logits.shape[2])
 
 
-# --- seeds shared out to processes ----------------------------------------------------------------------------------
-
-
-class Task(NamedTuple):
-    """What every share of the seeds learns from, as it goes through a pipe."""
-
-    settings: PolicySettings
-    scaling: Arrays
-    train: Labelled
-    test: Labelled
-
-
-class Trained(NamedTuple):
-    """What becomes of a share: see TrainedPolicies."""
-
-    weights: Arrays
-    acceleration: NDArray[np.uint8]
-    steering: NDArray[np.float32]
-
-
-class Shares:
-    """Seeds in shares: the first is trained in this process, each other in a process beside it.
-
-    `after_epoch(epoch, {split: METRICS [4, S]})` hears of an epoch when all shares have measured it, of all seeds in
-    their order. Leaving the block ends the processes.
-    """
-
-    def __init__(self, shares: Sequence[NDArray[np.int64]], task: Task, after_epoch: AfterEpoch) -> None:
-        self._shares, self._task, self._after_epoch = [share.tolist() for share in shares], task, after_epoch
-        self._measured: list[deque[Arrays]] = [deque() for _ in shares]
-        self._epoch = 0
-        self._trained: dict[int, Trained] = {}
-        self._processes: dict[Connection, tuple[int, BaseProcess]] = {}
-        self._senders: list[threading.Thread] = []
-
-    def __enter__(self) -> Self:
-        for number, seeds in enumerate(self._shares[1:], 1):
-            here, there = multiprocessing.Pipe()
-            context = multiprocessing.get_context("spawn")  # a fork would copy the locks of torch's threads
-            process = context.Process(target=_serve, args=(there,), name=f"policies {seeds}", daemon=True)
-            with deaf_to_interrupts():
-                process.start()
-            there.close()
-            self._processes[here] = number, process
-            # In a thread: it is taken in only when the process has loaded torch.
-            self._senders.append(threading.Thread(target=_send, args=(here, (seeds, self._task)), daemon=True))
-            self._senders[-1].start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        for _, process in self._processes.values():
-            process.kill()
-            process.join()
-        for sender in self._senders:
-            sender.join()
-        for pipe in self._processes:
-            pipe.close()
-
-    def train(self, device: str) -> list[Trained]:
-        """Train the first share, and wait for the others."""
-
-        def after_epoch(_: int, values: Arrays) -> None:
-            self._measured[0].append(values)
-            self._listen(timeout=0)
-
-        self._trained[0] = _train_share(self._shares[0], self._task, device, after_epoch)
-        while len(self._trained) < len(self._shares):
-            self._listen(timeout=None)
-        return [self._trained[number] for number in range(len(self._shares))]
-
-    def _listen(self, timeout: float | None) -> None:
-        """Take what has come from the others, and tell of the epochs that all have measured."""
-        waiting = [pipe for pipe, (number, _) in self._processes.items() if number not in self._trained]
-        ready = wait(waiting, timeout) if waiting else []
-        for pipe in waiting:
-            if pipe in ready:
-                self._take(pipe)
-        while all(self._measured):
-            parts = [measured.popleft() for measured in self._measured]
-            self._epoch += 1
-            self._after_epoch(
-                self._epoch, {split: np.concatenate([part[split] for part in parts], 1) for split in parts[0]}
-            )
-
-    def _take(self, pipe: Connection) -> None:
-        number, process = self._processes[pipe]
-        try:
-            told = pipe.recv()
-        except (EOFError, ConnectionError) as error:
-            process.join()
-            raise ChildProcessError(
-                f"the process that trained policy seeds {self._shares[number]} ended with code {process.exitcode}"
-            ) from error
-        if isinstance(told, Exception):
-            raise told
-        if isinstance(told, Trained):
-            self._trained[number] = told
-        else:
-            self._measured[number].append(told)
-
-
-def _send(pipe: Connection, what: tuple[list[int], Task]) -> None:
-    with suppress(OSError):  # the process has ended: whoever listens to it will know
-        pipe.send(what)
-
-
-def _serve(parent: Connection) -> None:
-    """In a process of its own: train the share that comes through the pipe, and send back what is told of it."""
-    obey_parent()
-    try:
-        seeds, task = parent.recv()
-        parent.send(_train_share(seeds, task, "cpu", lambda _, values: parent.send(values)))
-    except Exception as error:  # noqa: BLE001 - whatever it is, the parent has to know
-        error.add_note(traceback.format_exc())
-        with suppress(OSError):  # the parent may be gone
-            parent.send(error)
-
-
-def _train_share(seeds: Sequence[int], task: Task, device: str, after_epoch: AfterEpoch) -> Trained:
-    """Train some of the seeds in this process."""
-    data = _policy_data(task, torch.device(device))
-    with _one_thread():
-        ensemble = PolicyEnsemble(seeds, task.settings, data, after_epoch)
-        _fit(ensemble, task.settings, math.ceil(len(data.x) / task.settings.batch), device)
-        steering, logits = ensemble.outputs(data.views["test"][0])
-    return Trained(ensemble.weights(), logits.argmax(2).to(torch.uint8).cpu().numpy(), steering.cpu().numpy())
-
-
-def _processes(seeds: int, frames: int, device: str) -> int:
-    """How many processes train `seeds` policies that see `frames` each: as many as torch has threads, where it pays."""
-    if device != "cpu" or seeds * frames < _WORTH:
-        return 1
-    return min(torch.get_num_threads(), cores(), seeds)
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Torch's threads inside of an operation would wait for each other forty times a step."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
-
-
 # --- all of it ------------------------------------------------------------------------------------------------------
 
 
@@ -640,13 +486,12 @@ def train_policies(
 
     Train metrics are taken on a random part of the train split, the same for all seeds and epochs, that is no larger
     than the test split. `log(epoch, means over the seeds)` with names such as "test/acceleration_accuracy".
-    Raises BadInputError for data that cannot be learnt from, TrainingDivergedError for a loss that is not finite,
-    ChildProcessError where a process beside this one was killed.
+    Raises BadInputError for data that cannot be learnt from, TrainingDivergedError for a loss that is not finite.
     """
     started = time.perf_counter()
     _check(z_train, z_test, labels_train, labels_test, seeds, settings)
     scaling = normalisation(z_train, settings.normalise)
-    task = Task(settings, scaling, (z_train, _asked(labels_train)), (z_test, _asked(labels_test)))
+    data = _policy_data(scaling, (z_train, labels_train), (z_test, labels_test), torch.device(device))
     points: list[pd.DataFrame] = []
 
     def after_epoch(epoch: int, values: Arrays) -> None:
@@ -670,22 +515,48 @@ def train_policies(
         if progress:
             progress(epoch, settings.epochs)
 
-    processes = _processes(len(seeds), len(z_train) * settings.epochs, device)
-    with Shares(np.array_split(np.array(seeds), processes), task, after_epoch) as shares:
-        trained = shares.train(device)
+    with _one_thread():
+        ensemble = PolicyEnsemble(seeds, settings, data, after_epoch)
+        _fit(ensemble, settings, math.ceil(len(data.x) / settings.batch), device)
+        steering, logits = ensemble.outputs(data.views["test"][0])
     return TrainedPolicies(
-        weights={name: np.concatenate([share.weights[name] for share in trained]) for name in trained[0].weights}
-        | scaling,
+        weights=ensemble.weights() | scaling,
         curves=pd.concat(points, ignore_index=True)[list(CURVE_COLUMNS)],
-        acceleration=np.concatenate([share.acceleration for share in trained]),
-        steering=np.concatenate([share.steering for share in trained]),
+        acceleration=logits.argmax(2).to(torch.uint8).cpu().numpy(),
+        steering=steering.cpu().numpy(),
         seconds=time.perf_counter() - started,
     )
 
 
-def _asked(labels: pd.DataFrame) -> pd.DataFrame:
-    """The columns that policies learn."""
-    return labels[["steering", "acceleration"]]
+def join_policies(shares: Sequence[TrainedPolicies]) -> TrainedPolicies:
+    """Return policies that were trained in shares on the same data as if they had been trained at once.
+
+    `seconds` is the sum over the shares.
+    """
+    first = shares[0]
+    curves = pd.concat([share.curves for share in shares], ignore_index=True)
+    ranks = {name: curves[name].map({each: rank for rank, each in enumerate(order)}) for name, order in _ORDER.items()}
+    order = np.lexsort((curves["policy_seed"], ranks["metric"], ranks["split"], curves["epoch"]))
+    return TrainedPolicies(
+        weights={
+            name: value if name.startswith("z_") else np.concatenate([share.weights[name] for share in shares])
+            for name, value in first.weights.items()
+        },
+        curves=curves.iloc[order].reset_index(drop=True),
+        acceleration=np.concatenate([share.acceleration for share in shares]),
+        steering=np.concatenate([share.steering for share in shares]),
+        seconds=sum(share.seconds for share in shares),
+    )
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def _check(
@@ -716,16 +587,16 @@ def _check(
         )
 
 
-def _policy_data(task: Task, device: torch.device) -> PolicyData:
+def _policy_data(scaling: Arrays, train: Labelled, test: Labelled, device: torch.device) -> PolicyData:
     (x_train, y_train), (x_test, y_test) = (
         (
-            torch.from_numpy(normalise(task.scaling, z)).to(device),
+            torch.from_numpy(normalise(scaling, z)).to(device),
             Labels(
                 torch.from_numpy(np.array(labels["steering"], np.float32)).to(device),
                 torch.from_numpy(np.array(labels["acceleration"], np.int64)).to(device),
             ),
         )
-        for z, labels in (task.train, task.test)
+        for z, labels in (train, test)
     )
     some = np.random.default_rng(_SUBSET).permutation(len(x_train))[: len(x_test)]
     part = torch.from_numpy(np.sort(some)).to(device)

@@ -18,7 +18,6 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
 DIFF_LIMIT = 1_000_000  # bytes
-THREADS = 2  # a cell computes with; another number gives other last digits
 NEW_FILES = ("study", "sweeps", "tests", "benchmarks")  # elsewhere a new file may be a secret or a data set
 
 
@@ -49,14 +48,6 @@ def provenance(root: Path = ROOT) -> dict[str, Any]:
 def cores() -> int:
     """How many cores this process may use: a batch system or a container often gives fewer than the machine has."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def usual_threads() -> int:
-    """How many threads a cell computes with when nobody says otherwise.
-
-    A matter of the machine, never of how many cells are trained at a time: the bytes of a result depend on it.
-    """
-    return min(THREADS, cores())
 
 
 def packages() -> dict[str, str]:

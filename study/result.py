@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-import os
-import shutil
-import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,34 +9,26 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
-from safetensors import SafetensorError
-from safetensors.numpy import load_file, save
 
 from study.config import CEILING, BadInputError, Cell, Grid, StudySettings, cell_key
+from study.imported import Imported
+from study.products import Arrays, read_product, write_product
 
 FORMAT_VERSION = 1
 CURVE_COLUMNS = ("policy_seed", "stage", "split", "epoch", "metric", "value")
 TABLE_COLUMNS = ("sweep", "heads", "fraction", "encoder_seed", *CURVE_COLUMNS)
 NO_SEED = -1  # policy_seed of rows that belong to the encoder
 ARRAYS = ("encoder", "policies", "samples", "predictions")
-NETWORK = "network.pt2"  # beside a result that is to be committed: encoder and policies as one network
-FILES = ("curves.parquet", *(f"{part}.safetensors" for part in ARRAYS))  # beside cell.json, which names their digests
-
-Arrays = dict[str, NDArray[Any]]
-
-
-class TrainingDivergedError(RuntimeError):
-    """A loss became infinite or no number: the cell has failed, and trying again would not help."""
+HEAD = "cell.json"
 
 
 @dataclass(frozen=True)
 class CellJob:
-    """All that a worker needs to know to train a cell.
+    """All that training a cell needs to know, on any machine.
 
-    `frames` is the frame store's folder, `drives` that of the drives it was made from; under `scratch` lies what a
-    killed worker goes on from. `device` is "auto" or a torch device; a worker with `slot` k takes the k-th GPU when
-    there are several.
+    `frames` is the frame store's folder and `drives` that of the drives it was made from, `imported` when these are not
+    our town's; where the frames are missing they are made from them. `scratch` holds checkpoints and the products of
+    finished stages. `device` is "auto" or a torch device. Folders are relative to the working folder of whoever runs.
     """
 
     cell: Cell
@@ -53,12 +40,7 @@ class CellJob:
     scratch: Path
     device: str = "auto"
     threads: int = 1
-    slot: int = 0
-
-    @property
-    def result_folder(self) -> Path:
-        """Where the result lies between its end and its commit."""
-        return self.scratch / "cells" / self.key
+    imported: Imported | None = None
 
 
 @dataclass(frozen=True)
@@ -92,55 +74,27 @@ class CellResult:
 
     def save(self, folder: Path, add: Callable[[Path], object] | None = None) -> Path:
         """Write the result as `folder`, whole or not at all, with what `add` writes into it."""
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as name:
-            draft = Path(name) / folder.name
-            draft.mkdir()
-            for part in ARRAYS:
-                arrays = {key: np.ascontiguousarray(value) for key, value in getattr(self, part).items()}
-                # Not `save_file`, whose error of a full disk is no OSError.
-                (draft / f"{part}.safetensors").write_bytes(save(arrays))
-            self.curves.to_parquet(draft / "curves.parquet", index=False)
-            head = {
-                "format_version": FORMAT_VERSION,
-                "digests": {file.name: _digest(file) for file in sorted(draft.iterdir())},
-                "cell": self.cell.model_dump(mode="json"),
-                "key": self.key,
-                "settings": self.settings,
-                "facts": self.facts,
-            }
-            (draft / "cell.json").write_text(json.dumps(head, indent=1), encoding="utf-8")
-            if add:
-                add(draft)
-            if folder.exists():
-                shutil.rmtree(folder)
-            os.rename(draft, folder)  # noqa: PTH104 - the one atomic step
-        return folder
+        head = {
+            "format_version": FORMAT_VERSION,
+            "cell": self.cell.model_dump(mode="json"),
+            "key": self.key,
+            "settings": self.settings,
+            "facts": self.facts,
+        }
+        return write_product(folder, HEAD, head, {part: getattr(self, part) for part in ARRAYS}, self.curves, add)
 
     @staticmethod
     def load(folder: Path) -> CellResult:
         """Read what `save` wrote. Raises BadInputError when it is not whole."""
+        head, parts, curves = read_product(folder, HEAD, ARRAYS)
+        if head.get("format_version") != FORMAT_VERSION:
+            found = head.get("format_version")
+            raise BadInputError(f"{folder}: format {found}; this program reads {FORMAT_VERSION}; run the cell again")
         try:
-            head = json.loads((folder / "cell.json").read_text(encoding="utf-8"))
-            if head["format_version"] != FORMAT_VERSION:
-                raise BadInputError(f"{folder}: format {head['format_version']}; this program reads {FORMAT_VERSION}")
-            for name, digest in head.get("digests", {}).items():  # results from before there were any have none
-                if name not in FILES or _digest(folder / name) != digest:
-                    raise ValueError(f"{name} does not match its digest")  # noqa: TRY301 - one report for all damage
-            return CellResult(
-                cell=Cell.model_validate(head["cell"]),
-                key=str(head["key"]),
-                settings=head["settings"],
-                curves=pd.read_parquet(folder / "curves.parquet"),
-                facts=head["facts"],
-                **{part: load_file(folder / f"{part}.safetensors") for part in ARRAYS},
-            )
-        except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
-            raise BadInputError(f"{folder} is no whole cell result: {error}; run the cell again") from error
-
-
-def _digest(file: Path) -> str:
-    return hashlib.sha256(file.read_bytes()).hexdigest()
+            own = {name: head[name] for name in ("settings", "facts")}
+            return CellResult(Cell.model_validate(head["cell"]), str(head["key"]), curves=curves, **own, **parts)
+        except (ValueError, KeyError) as error:
+            raise BadInputError(f"{folder} is not a whole cell result: {error}; run the cell again") from error
 
 
 def load_results(folder: Path) -> Iterator[CellResult]:

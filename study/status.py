@@ -1,6 +1,6 @@
 """How far a sweep is, asked from any terminal while it runs: what is finished, what runs where, what is left.
 
-MLflow is asked, not the queue: a cell's attempts say who runs them and have signs of life.
+MLflow is asked, not Optuna: a cell's attempts say who runs them and have signs of life.
 
 python -m study.sweep status heads
 """
@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING, Literal
 
 from study.command import Parser, add_tracking_option
 from study.config import masked
-from study.cost import CELL_START_S, cell_cost, clock
-from study.display import ENCODER_SHARE, STAGES, show_table
+from study.display import show_table
 from study.plan import Plan, add_plan_options, given_plan, look_up
+from study.stages import CELL_STAGES, RESULT_S, STAGES, Work, cell_cost, clock, share_done
 
 if TYPE_CHECKING:
     from study.tracking import Attempt
@@ -44,7 +44,7 @@ class CellStatus:
     """Where a cell stands. Times in s: `since` 1970, `took` by the finished attempt, `quiet` without a sign of life.
 
     `silent`: it says RUNNING and nothing has been heard for two minutes; `dead`: its process on this host is gone.
-    Both wait for a sweep or a worker to take them up again. `share`: of the cell's work that is done.
+    Both wait for a sweep to take them up again. `share`: of the cell's work that is done.
     """
 
     key: str
@@ -78,19 +78,18 @@ def _cell_status(plan: Plan, key: str, attempts: Sequence[Attempt], now: float, 
         return found
     last = attempts[-1]
     if last.status == "FAILED":
-        state: State = "waiting" if "again" in last.tags else "failed"
-        return dataclasses.replace(found, state=state, reason=_first(last.tags.get("reason", "unknown")))
+        return dataclasses.replace(found, state="failed", reason=_first(last.tags.get("reason", "unknown")))
     if last.status != "RUNNING":
         return found
     tags = last.tags
     quiet = max(0.0, now - float(tags.get("alive", last.started)) / 1000)
-    state = "silent" if quiet > SILENT else "running"
+    state: State = "silent" if quiet > SILENT else "running"
     if tags.get("host") == host and not _runs(tags.get("process", "")):
         state = "dead"
     stage, _, steps = tags.get("progress", "").partition(" ")
     part, whole = (int(number) for number in steps.split("/")) if steps else (0, 1)
     epochs = {"encoder": plan.settings.encoder.epochs, "policy": plan.settings.policy.epochs}.get(stage, 0)
-    before, own = (0.0, ENCODER_SHARE) if stage == "encoder" else (ENCODER_SHARE, 1 - ENCODER_SHARE)
+    work = Work(plan.settings, plan.cells[key], plan.grid.policy_seeds)
     return dataclasses.replace(
         found,
         state=state,
@@ -102,7 +101,7 @@ def _cell_status(plan: Plan, key: str, attempts: Sequence[Attempt], now: float, 
         stage=stage,
         epoch=math.ceil(part * epochs / whole),
         epochs=epochs,
-        share=before + own * part / whole if stage else 0.0,
+        share=share_done(CELL_STAGES, work, STAGES[stage], part / whole) if stage in STAGES else 0.0,
     )
 
 
@@ -133,7 +132,7 @@ def seconds_left(plan: Plan, cells: Sequence[CellStatus], now: float, *, frames_
         if cell.took is not None:
             expected, measured = expected + costs[cell.key], measured + cell.took
         if cell.state == "running" and cell.since is not None and cell.share > 0:
-            begun = CELL_START_S + (costs[cell.key] - CELL_START_S) * cell.share
+            begun = RESULT_S + (costs[cell.key] - RESULT_S) * cell.share
             expected, measured = expected + begun, measured + now - cell.since
         if cell.state not in ("finished", "failed"):
             left += costs[cell.key] * (1 - (cell.share if cell.state == "running" else 0.0))
@@ -197,7 +196,8 @@ def _row(cell: CellStatus, now: float) -> tuple[str, str, str, str, str]:
     elif cell.state == "failed":
         how = cell.reason
     elif cell.since is not None:
-        how = f"{STAGES.get(cell.stage, cell.stage)}, epoch {cell.epoch} of {cell.epochs}" if cell.stage else "starting"
+        how = STAGES[cell.stage].activity if cell.stage in STAGES else "starting"
+        how += f", epoch {cell.epoch} of {cell.epochs}" if cell.epochs else ""
         if cell.state != "running":
             how += f"; no sign of life for {clock(cell.quiet)}"
         since = f"since {time.strftime('%H:%M', time.localtime(cell.since))} ({clock(now - cell.since)})"

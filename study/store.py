@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from study.command import alone
 from study.config import DEFAULT_TRACKING, BadInputError, masked
 
 # Nothing phones home, nothing is printed. A lost server is asked again for about half a minute, MLflow's own default
@@ -35,6 +34,7 @@ for _name, _value in {
 }.items():
     os.environ.setdefault(_name, _value)
 
+from filelock import FileLock  # noqa: E402
 from mlflow.exceptions import MlflowException  # noqa: E402 - reads the above
 from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore  # noqa: E402
 from mlflow.tracking import MlflowClient  # noqa: E402
@@ -193,13 +193,13 @@ def _prepare_file(path: Path, artifacts: Path, lock: Path, shown: str) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         if not path.exists():
             # MLflow needs seconds for its tables; a process killed in between would leave a database half made.
-            with alone(lock):
+            with FileLock(lock):
                 if not path.exists():
                     drafts = path.with_name(f".{path.name}.draft")  # a folder, since SQLite writes a journal beside
                     shutil.rmtree(drafts, ignore_errors=True)
                     drafts.mkdir()
                     draft = drafts / path.name
-                    SqlAlchemyStore(f"{SQLITE}{draft}", str(artifacts))._dispose_engine()  # noqa: SLF001 - closes it
+                    SqlAlchemyStore(f"{SQLITE}{draft}", str(artifacts))
                     draft.replace(path)
                     shutil.rmtree(drafts)
             return

@@ -13,8 +13,8 @@ import pandas as pd
 
 from study import claims, confounds, stats
 from study.config import ACCELERATIONS, CEILING, HEAD_SETS, parameter_counts
-from study.cost import cell_cost, data_cost, total
 from study.result import CellResult, SweepRecord
+from study.stages import cell_cost, data_cost, total
 from study.stats import Estimate, Panel, Point
 
 FORMAT_VERSION = 1

@@ -8,19 +8,16 @@ python -m study.sweep heads --data data/imported/scenes
 from __future__ import annotations
 
 import argparse
-import fcntl
 import json
-import os
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from study.command import Parser, run, stoppable, typed
-from study.config import HEADS, SHARED_QUEUES, BadInputError, parameter_counts
-from study.cost import Cost, cell_cost, clock, size, total
+from study.config import HEADS, BadInputError, parameter_counts
 from study.plan import Plan, add_plan_options, add_run_options, check_run_options, given_plan, look_up
+from study.stages import Cost, cell_cost, clock, size, total
 
 if TYPE_CHECKING:
     from study.tracking import Tracker
@@ -44,7 +41,7 @@ def parser() -> Parser:
     add_plan_options(made)
     made.add_argument("--dry-run", action="store_true", help="show what would run, what is done, and what it costs")
     made.add_argument("--json", action="store_true", help="with --dry-run: one JSON object on stdout")
-    add_run_options(made, "cells trained at a time; 0 with a shared queue: watch others")
+    add_run_options(made)
     made.add_argument(
         "--import-results", type=Path, metavar="DIR", help="train nothing: commit what study.train has left in DIR"
     )
@@ -66,15 +63,12 @@ def main(args: Sequence[str]) -> int:
     plan = given_plan(options)
     if options.json and not options.dry_run:
         raise BadInputError("--json goes with --dry-run; add --dry-run")
-    shared = options.queue.startswith(SHARED_QUEUES)
-    check_run_options(options, fewest_workers=0 if shared else 1)
+    check_run_options(options)
     if options.dry_run:
         return dry_run(plan, options.tracking, as_json=options.json)
     command = typed("study.sweep", args)
-    with nullcontext() if shared else only_sweep(Path("mlruns") / "sweep.lock"):
-        if options.import_results:
-            return stoppable(lambda: import_results(plan, options), command)
-        return stoppable(lambda: execute(plan, options, command), command)
+    run_plan = import_results if options.import_results else execute
+    return stoppable(lambda: run_plan(plan, options, command), command)
 
 
 # --- dry run --------------------------------------------------------------------------------------------------------
@@ -131,55 +125,39 @@ def dry_run(plan: Plan, tracking: str, *, as_json: bool) -> int:
 # --- the run --------------------------------------------------------------------------------------------------------
 
 
-@contextmanager
-def only_sweep(path: Path) -> Iterator[None]:
-    """Hold the lock of this working folder: SQLite as a queue bears one process that asks."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a+") as stream:
-        try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            stream.seek(0)
-            raise BadInputError(
-                f"another sweep runs in this folder (process {stream.read().strip() or 'unknown'}); "
-                "wait for it, or use --workers N there"
-            ) from error
-        stream.seek(0)
-        stream.truncate()
-        stream.write(str(os.getpid()))
-        stream.flush()
-        yield
-
-
 def execute(plan: Plan, options: argparse.Namespace, command: str) -> int:
     """Run what is not finished, then write the report."""
     # Imported here, so that --help and --dry-run need none of it.
-    from study.crew import tell_failed, work  # noqa: PLC0415
+    from study.run_cells import hold_store, report_failed, run_cells  # noqa: PLC0415
     from study.tracking import Tracker  # noqa: PLC0415
 
-    tracker = Tracker(options.tracking)
-    failed = work(plan, options, tracker, lead=True)
-    if not options.no_report:
-        print("writing the report", file=sys.stderr)
-        print(f"report: {_publish(plan, tracker)}", file=sys.stderr)
-    return tell_failed(plan, failed, command)
+    with hold_store(options.tracking, plan.grid.name, wait=options.wait):
+        tracker = Tracker(options.tracking)
+        failed = run_cells(plan, options, tracker)
+        if not options.no_report:
+            print("writing the report", file=sys.stderr)
+            print(f"report: {_publish(plan, tracker)}", file=sys.stderr)
+    return report_failed(plan, failed, command)
 
 
-def import_results(plan: Plan, options: argparse.Namespace) -> int:
+def import_results(plan: Plan, options: argparse.Namespace, command: str) -> int:
     """Commit what was trained elsewhere; then write the report, or say which cells are missing."""
     from study.intake import planned_results, take_in  # noqa: PLC0415 - as above
+    from study.run_cells import hold_store  # noqa: PLC0415
 
     keys = planned_results(plan, options.import_results)
     from study.tracking import Tracker  # noqa: PLC0415
 
-    tracker = Tracker(options.tracking)
-    missing = take_in(plan, options.import_results, keys, tracker)
-    for key in missing:
-        print(f"missing: {plan.cells[key].label} ({key})", file=sys.stderr)
-    if missing:
-        print("Import them, too, or train them here: the same command without --import-results.", file=sys.stderr)
-    elif not options.no_report:
-        print(f"report: {_publish(plan, tracker)}", file=sys.stderr)
+    with hold_store(options.tracking, plan.grid.name, wait=options.wait):
+        tracker = Tracker(options.tracking)
+        missing = take_in(plan, options.import_results, keys, tracker)
+        for key in missing:
+            print(f"missing: {plan.cells[key].label} ({key})", file=sys.stderr)
+        if missing:
+            here = command.replace(f"--import-results {options.import_results}", "").strip()
+            print(f"Import them, too, or train them here: {here}", file=sys.stderr)
+        elif not options.no_report:
+            print(f"report: {_publish(plan, tracker)}", file=sys.stderr)
     return 0
 
 

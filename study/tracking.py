@@ -26,8 +26,8 @@ from pathlib import Path
 from typing import Any, Literal, Self
 
 import pandas as pd
+from filelock import FileLock
 
-from study.command import alone
 from study.config import DEFAULT_TRACKING, BadInputError, Cell, Grid, StudySettings, content_key, masked
 from study.mlmodel import log_model
 from study.points import COMMIT, Point, bands, cell_points, facts_of, flatten, points, scores_of
@@ -44,7 +44,7 @@ RESULT_FILES = (*(f"{part}.safetensors" for part in ARRAYS), "curves.parquet", "
 PLAN_VERSION = 1
 VALUE_LIMIT = 4000  # characters of a parameter or tag; MLflow takes 6000 and 8000, its databases 8000
 HOST, PROCESS, ALIVE = "host", "process", "alive"  # tags of an attempt: who writes it, and when last [ms since 1970]
-AGAIN = "again"  # tag of a failed attempt that is not the last
+PERMANENT = "permanent"  # tag of a failed attempt: another try would not help
 SIGN = 5.0  # [s] between two signs of life
 PARENT = "mlflow.parentRunId"
 FLUSH = 2.0  # [s] between two writes of live curves
@@ -181,18 +181,15 @@ class Tracker:
         planned: Mapping[str, Cell],
         data: Mapping[str, Any],
         provenance: Mapping[str, Any],
-        *,
-        join: bool = False,
     ) -> str:
         """The run id of this plan's sweep run: the one there is, taken up again, or a new one.
 
-        `data` is the frame store's manifest; it becomes an MLflow dataset whose digest is its `key`. Who only wants to
-        `join` what another machine has opened leaves what is written there as it is.
+        `data` is the frame store's manifest; it becomes an MLflow dataset whose digest is its `key`.
         """
         plan, key = _plan(grid, profile, settings, planned)
         name = f"{grid.name} ({profile})"
         facts = {name: value for name, value in provenance.items() if name != "diff"}
-        with self._guard(), alone(self._store.lock) if self._store.lock else nullcontext():
+        with self._guard(), FileLock(self._store.lock) if self._store.lock else nullcontext():
             sweeps = self._search("tags.kind = 'sweep'")
             latest = max((_opened(run) for run in sweeps), default=0)
             tags = {
@@ -206,8 +203,6 @@ class Tracker:
             if mine:
                 run_id = str(mine[0].info.run_id)
                 self.client.update_run(run_id, status="RUNNING")
-                if join:
-                    return run_id
             else:
                 identity = {"kind": "sweep", "sweep": grid.name, "profile": profile, "plan_key": key, NOTE: grid.title}
                 identity["mlflow.source.name"] = _short(str(provenance.get("command", "python -m study.sweep")))
@@ -231,13 +226,6 @@ class Tracker:
             if data:
                 insert(self.client.log_inputs, run_id, datasets=[_dataset(data)])
         return run_id
-
-    def runs_elsewhere(self, grid: Grid, profile: str, settings: StudySettings, planned: Mapping[str, Cell]) -> bool:
-        """Whether another machine has this plan's sweep run open now. In a database file, a kill has left it so."""
-        _, key = _plan(grid, profile, settings, planned)
-        with self._guard():
-            open_ = f"tags.plan_key = '{key}' and attributes.status = 'RUNNING'"
-            return self._store.database is None and bool(self._search(open_))
 
     def _reused(self, planned: Mapping[str, Cell], name: str) -> str:
         """Planned cells that another sweep has finished, in words."""
@@ -352,6 +340,15 @@ class Tracker:
                     found.setdefault(key, []).append(attempt)
         return found
 
+    def given_up(self, keys: Collection[str]) -> dict[str, str]:
+        """Key -> reason of the cells whose last attempt has failed for a reason that another try would meet again."""
+        last = {key: attempts[-1] for key, attempts in self.attempts(keys).items()}
+        return {
+            key: attempt.tags.get("reason", "unknown")
+            for key, attempt in last.items()
+            if attempt.status == "FAILED" and PERMANENT in attempt.tags
+        }
+
     def start_cell(
         self, sweep_run_id: str, cell: Cell, key: str, settings: StudySettings, policy_seeds: int
     ) -> CellRun:
@@ -389,10 +386,10 @@ class Tracker:
                 self.client.log_inputs(run_id, datasets=sweep.inputs.dataset_inputs)
         return CellRun(run_id, key, cell, started, self.client)
 
-    def commit(self, cell_run: CellRun, result: CellResult, network: Path | None = None) -> str:
+    def commit(self, cell_run: CellRun, result: CellResult, network: bytes = b"") -> str:
         """Log a result whole, and only then mark its run FINISHED. Returns the run id that holds the key's result.
 
-        `network`, the result's as study.exported writes it, becomes the run's MLflow model `driver`.
+        `network`, the result's as study.exported makes it, becomes the run's MLflow model `driver`.
         When another attempt has finished this key meanwhile, that one counts and this run ends as KILLED. After a
         TrackerLostError it can be called again: nothing is doubled.
         """
@@ -457,15 +454,15 @@ class Tracker:
             self.client.log_batch(cell_run.seeds[seed], metrics=metrics)
             self.client.set_terminated(cell_run.seeds[seed], "FINISHED")
 
-    def fail(self, cell_run: CellRun, reason: str, *, again: bool = False) -> None:
+    def fail(self, cell_run: CellRun, reason: str, *, permanent: bool = False) -> None:
         """End an attempt that cannot be finished; the reason becomes a tag and, in full, an artifact.
 
-        `again`: the cell waits for another attempt.
+        `permanent`: the next start of the sweep need not try again.
         """
         cell_run.stop()
         with self._guard():
             self.client.log_text(cell_run.run_id, masked(reason), "failure.txt")
-            tags = {"reason": masked(reason)} | ({AGAIN: "true"} if again else {})
+            tags = {"reason": masked(reason)} | ({PERMANENT: "true"} if permanent else {})
             self._close(cell_run.run_id, "FAILED", tags)
 
     def interrupt(self, cell_run: CellRun, reason: str = "stopped") -> None:

@@ -4,33 +4,40 @@ python -m study.train heads --profile paper --out results
 python -m study.train heads --profile paper --out results --device cuda:1 --limit-seconds 540
 
 The drives lie in data/episodes, recorded elsewhere by `python -m study.data record` with the same settings, and
-`python -m study.sweep NAME --import-results DIR` takes the results to MLflow. Several of these commands may work on one
-folder at a time, one for each GPU, say: every cell is trained by one of them.
+`python -m study.sweep NAME --import-results DIR` takes the results to MLflow. All cores and GPUs are used where Dask is
+installed; without it, cells are trained one after the other in this process.
 """
 
 from __future__ import annotations
 
-import fcntl
+import argparse
+import importlib.util
 import shutil
 import signal
 import sys
 import time
-import traceback
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from filelock import FileLock, Timeout
+
+from study.cell import cell_flow, product_folders
 from study.command import EXIT_FAILED, EXIT_INTERRUPTED, Parser, run, stoppable, typed
 from study.config import BadInputError
-from study.cost import cell_cost
-from study.data import DATA, prepare
-from study.plan import Plan, add_machine_options, add_plan_options, check_machine, given_plan
-from study.scratch import using
+from study.data import DATA, data_flow
+from study.display import Display
+from study.engine.flows import SilentListener, run_flow, run_flows
+from study.engine.inline import InlineEngine
+from study.engine.tasks import Failure
+from study.plan import Plan, add_machine_options, add_plan_options, cell_jobs, check_machine, given_plan
+from study.provenance import cores
+from study.result import CellJob, CellResult
+from study.stages import Batch, Flow, cell_cost
 
-if TYPE_CHECKING:  # --help and errors in the settings come without these
-    from study.display import Display
-    from study.result import CellJob
+if TYPE_CHECKING:  # Dask, which may be missing
+    from study.engine.cluster import DaskEngine
 
 EXIT_AGAIN = 75  # cells are left: the same command goes on
 
@@ -64,95 +71,104 @@ def main(args: Sequence[str]) -> int:
         signal.signal(signal.SIGALRM, signal.default_int_handler)
         signal.setitimer(signal.ITIMER_REAL, limit)
     try:
-        code = stoppable(lambda: train(plan, options.out, options.device, options.threads), typed("study.train", args))
+        code = stoppable(lambda: train(plan, options.out, options), typed("study.train", args))
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
     up = limit is not None and time.monotonic() - began >= limit
     return EXIT_AGAIN if up and code == EXIT_INTERRUPTED else code
 
 
-def train(plan: Plan, out: Path, device: str, threads: int) -> int:
-    """Train the cells that `out` lacks, one after the other, and return the exit code."""
-    from study.display import Display  # noqa: PLC0415
-    from study.provenance import cores  # noqa: PLC0415
-    from study.result import CellJob  # noqa: PLC0415
-
+def train(plan: Plan, out: Path, options: argparse.Namespace) -> int:
+    """Train the cells that `out` lacks, and return the exit code."""
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise BadInputError(f"cannot write to {out}: {error.strerror}; name another folder with --out") from error
     jobs = {
-        key: CellJob(cell, key, plan.settings, plan.grid.policy_seeds, plan.frames, plan.drives, DATA, device, threads)
-        for key, cell in plan.cells.items()
-        if not (out / key).is_dir()
+        key: job for key, job in cell_jobs(plan, options.device, options.threads).items() if not (out / key).is_dir()
     }
     costs = {key: cell_cost(plan.settings, job.cell, job.policy_seeds).seconds for key, job in jobs.items()}
     labels = {key: cell.label for key, cell in plan.cells.items()}
-    ready = (plan.frames / "manifest.json").is_file()
-    failed = {}
-    with (
-        Display(
-            f"{plan.grid.name} ({plan.profile})", costs, labels, 0.0 if ready else plan.data_cost.seconds
-        ) as display,
-        using(DATA, lambda _: ()),
-    ):
-        if jobs:
-            _check_installed()
-            prepare(plan.settings, DATA, cores(), display.data, plan.imported)
-            shutil.copyfile(plan.frames / "manifest.json", out / f"frames-{plan.frames.name}.json")
-        for key, job in jobs.items():
-            with _taken(out / f".{key}.lock") as mine:
-                if not mine or (out / key).is_dir():
-                    display.say(f"{labels[key]}: another process has taken it")
-                elif reason := _train_cell(job, out / key, display):
-                    failed[key] = reason
-    for key, reason in failed.items():
+    data_seconds = 0.0 if (plan.frames / "manifest.json").is_file() else plan.data_cost.seconds
+    if not jobs:
+        return 0
+    DATA.mkdir(exist_ok=True)
+    _check_installed()
+    title = f"{plan.grid.name} ({plan.profile})"
+    with Display(title, costs, labels, data_seconds, plan.works) as display, _engine(options) as engine:
+        run_flow(data_flow(plan.settings, DATA, plan.imported), engine, display.data)
+        shutil.copyfile(plan.frames / "manifest.json", out / f"frames-{plan.frames.name}.json")
+        saving = _Saving(out, jobs, display, one_share=engine.gpus() > 0)
+        run_flows(engine, saving.next_flow, saving)
+    for key, reason in saving.reasons.items():
         print(f"failed: {labels[key]} ({key}): {reason.strip()}", file=sys.stderr)
-    if failed:
+    if saving.reasons:
         return EXIT_FAILED
     return 0 if all((out / key).is_dir() for key in plan.cells) else EXIT_AGAIN
 
 
+def _engine(options: argparse.Namespace) -> DaskEngine | InlineEngine:
+    """Use Dask, and with it all cores and GPUs, where it is installed."""
+    try:
+        from study.engine.cluster import local_engine, visible_gpus  # noqa: PLC0415
+    except ModuleNotFoundError:
+        return InlineEngine()
+    return local_engine(max(1, cores() // options.threads), DATA / "tmp", visible_gpus(options.device))
+
+
 def _check_installed() -> None:
     """Raise BadInputError when the machine lacks what training needs, before hours are spent on the data."""
-    try:
-        import study.cell  # noqa: F401, PLC0415
-    except ModuleNotFoundError as error:
-        raise BadInputError(
-            f"{error.name} is not installed here; bring its wheel along (WHEELS in benchmarks/paper_scale.sh)"
-        ) from error
+    for name in ("torch", "lightning", "pandas", "pyarrow", "cv2", "safetensors", "filelock"):
+        if importlib.util.find_spec(name) is None:
+            raise BadInputError(
+                f"{name} is not installed here; bring its wheel along (WHEELS in benchmarks/paper_scale.sh)"
+            )
 
 
-def _train_cell(job: CellJob, folder: Path, display: Display) -> str:
-    """Train a cell and save its result as `folder`. Returns why it failed, or nothing."""
-    from study.cell import run_cell  # noqa: PLC0415
-    from study.result import CellResult, TrainingDivergedError  # noqa: PLC0415
+class _Saving(SilentListener):
+    """Saves results as folders. Each cell is locked while it is trained, so several commands may share `out`."""
 
-    display.start(job.key)
-    reason = ""
-    try:
-        if not job.result_folder.is_dir():  # else trained before, and only what follows was cut off
-            run_cell(job, lambda *_: None, lambda *what: display.progress(job.key, *what))
-        CellResult.load(job.result_folder).save(folder)
-        shutil.rmtree(job.result_folder)
-    except (BadInputError, TrainingDivergedError) as error:
-        reason = str(error)
-    except Exception:  # noqa: BLE001 - whatever it is belongs to this cell, and the others go on
-        reason = traceback.format_exc()
-    (display.fail if reason else display.finish)(job.key)
-    return reason
+    def __init__(self, out: Path, jobs: dict[str, CellJob], display: Display, *, one_share: bool) -> None:
+        self._out, self._jobs, self._display, self._one_share = out, jobs, display, one_share
+        self._left = list(jobs)
+        self._locks: dict[str, FileLock] = {}
+        self.reasons: dict[str, str] = {}
 
+    def next_flow(self) -> tuple[str, Flow[tuple[CellResult, bytes]]] | None:
+        """Return the flow of the next cell that nobody else trains."""
+        while self._left:
+            key = self._left.pop(0)
+            lock = FileLock(self._out / f".{key}.lock")
+            with suppress(Timeout):
+                lock.acquire(blocking=False)
+                self._locks[key] = lock
+                if not (self._out / key).is_dir():
+                    self._display.start(key)
+                    return key, cell_flow(self._jobs[key], one_share=self._one_share)
+            self._display.say(f"{self._jobs[key].cell.label}: another process has taken it")
+        return None
 
-@contextmanager
-def _taken(path: Path) -> Iterator[bool]:
-    """Whether this process holds the cell of that lock; another one may, until it ends."""
-    with path.open("w") as stream:
-        try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            yield False
-            return
-        yield True
+    def progress(self, name: str, batch: Batch, done: int, total: int) -> None:
+        """Show how far the cell is."""
+        self._display.progress(name, batch.tasks[0].stage.name, done, total)
+
+    def finished(self, name: str, value: tuple[CellResult, bytes]) -> None:
+        """Save the result."""
+        value[0].save(self._out / name)
+        for folder in product_folders(self._jobs[name].scratch, name):
+            shutil.rmtree(folder, ignore_errors=True)
+        self._display.finish(name)
+        self._locks.pop(name).release()
+
+    def failed(self, name: str, failure: Failure) -> None:
+        """Keep the reason."""
+        self.reasons[name] = failure.reason
+        self._display.fail(name)
+        self._locks.pop(name).release()
+
+    def tick(self) -> None:
+        """Draw the display again."""
+        self._display.tick()
 
 
 if __name__ == "__main__":

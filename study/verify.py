@@ -22,13 +22,14 @@ from numpy.typing import NDArray
 
 from study.command import Parser, add_tracking_option
 from study.config import BadInputError, Cell, StudySettings, cell_key, one_of
-from study.cost import cell_cost
-from study.data import DATA, prepare
+from study.data import DATA, data_flow
 from study.display import Display
+from study.engine.flows import run_flow
 from study.plan import Plan, add_plan_options, given_plan, look_up
 from study.points import scores_of
 from study.provenance import cores
 from study.result import ARRAYS, CURVE_COLUMNS, CellJob, CellResult
+from study.stages import cell_cost
 
 EXIT_DIFFERS = 1
 COMPUTING = ("torch", "lightning", "numpy", "pandas")  # packages whose version can change a number
@@ -133,21 +134,26 @@ def choose(finished: Mapping[str, Cell], wanted: str | None, seed: int) -> str:
 
 def compute_again(plan: Plan, recorded: CellResult, display: Display) -> CellResult:
     """The cell of a result once more, as its facts say: threads, device, precision. Leaves only frames behind."""
-    import torch  # noqa: PLC0415 - finding nothing to verify needs none of these
+    # Finding nothing to verify needs none of these.
+    import torch  # noqa: PLC0415
 
-    from study.cell import run_cell  # noqa: PLC0415
+    from study.cell import cell_flow  # noqa: PLC0415
+    from study.engine.cluster import local_engine  # noqa: PLC0415
 
     own = {name: value for name, value in recorded.settings.items() if name in StudySettings.model_fields}
     own["encoder"] = own["encoder"] | {"precision": recorded.facts["precision"]}  # "auto" is another elsewhere
     settings = StudySettings.model_validate(own)
     seeds = int(recorded.settings["policy_seeds"])
-    frames = prepare(plan.settings, DATA, cores(), display.data, plan.imported)
-    gpus = [f"cuda:{index}" for index in range(torch.cuda.device_count())]
+    gpus = [str(index) for index in range(torch.cuda.device_count())]
     name = recorded.facts["device"]
-    alike = [gpu for gpu in gpus if torch.cuda.get_device_name(gpu) == name]
-    device = "cpu" if name.lower() == "cpu" else next(iter(alike or gpus), "cpu")
-    display.start(recorded.key)
-    with tempfile.TemporaryDirectory(prefix=".verify-", dir=DATA) as scratch:
+    alike = [gpu for gpu in gpus if torch.cuda.get_device_name(int(gpu)) == name]
+    use = [] if name.lower() == "cpu" else (alike or gpus)[:1]
+    with (
+        local_engine(cores(), DATA / "tmp", use) as engine,
+        tempfile.TemporaryDirectory(prefix=".verify-", dir=DATA) as scratch,
+    ):
+        frames = run_flow(data_flow(plan.settings, DATA, plan.imported), engine, display.data)
+        display.start(recorded.key)
         job = CellJob(
             recorded.cell,
             cell_key(settings, recorded.cell, seeds, recorded.settings["frames_key"]),
@@ -156,11 +162,14 @@ def compute_again(plan: Plan, recorded: CellResult, display: Display) -> CellRes
             frames,
             plan.drives,
             Path(scratch),
-            device,
+            "auto" if use else "cpu",
             int(recorded.facts["threads"]),
+            plan.imported,
         )
-        run_cell(job, lambda *_: None, lambda *how: display.progress(recorded.key, *how))
-        return CellResult.load(job.result_folder)
+        again, _ = run_flow(
+            cell_flow(job, one_share=bool(use)), engine, lambda *how: display.progress(recorded.key, *how)
+        )
+    return again
 
 
 # --- the command ----------------------------------------------------------------------------------------------------
@@ -189,7 +198,9 @@ def main(args: Sequence[str]) -> int:
     recorded = tracker.load_result(runs[key])
     cost = cell_cost(plan.settings, cell, plan.grid.policy_seeds).seconds
     ready = (plan.frames / "manifest.json").is_file()
-    with Display("verify", {key: cost}, {key: cell.label}, 0.0 if ready else plan.data_cost.seconds) as display:
+    data_seconds = 0.0 if ready else plan.data_cost.seconds
+    DATA.mkdir(exist_ok=True)
+    with Display("verify", {key: cost}, {key: cell.label}, data_seconds, plan.works) as display:
         again = compute_again(plan, recorded, display)
     return report(recorded, again, plan.grid.rules.encoder_allowance)
 

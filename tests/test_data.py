@@ -8,9 +8,9 @@ from types import SimpleNamespace
 import pytest
 
 from study.config import BadInputError, load_profile
-from study.cost import data_cost
 from study.data import frames_folder, main, prepare
 from study.frames import open_frames
+from study.stages import data_cost
 
 SWEEPS = Path(__file__).parent.parent / "sweeps"
 TINY = {

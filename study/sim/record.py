@@ -1,22 +1,22 @@
-"""Recording: drives of TownEnv as Episodes, one for each seed, on as many processes as there are."""
+"""Recording: drives of TownEnv as Episodes, one for each seed."""
 
 from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from filelock import FileLock
 
-from study.command import WRITE_ERRORS, alone, cannot_write
 from study.config import FORMAT_VERSIONS, BadInputError, RecordingSettings, TownSettings, drive_name
 from study.episode import Agent, Episode, Lane, Light, empty_states, write_episode
-from study.pool import Pool
 from study.sim.autopilot import DT, STEERING_UNIT
 from study.sim.env import TownEnv, Traffic
 from study.sim.town import LANE_WIDTH, LENGTH, WIDTH, Floats, Town
+from study.stages import RECORD, Batch, Flow, Task
 
 FORMAT_VERSION = FORMAT_VERSIONS["episodes"]  # raised when the same settings and seed give another drive
 BEYOND = 60.0  # of the planned route that is recorded behind the last position [m]
@@ -162,38 +162,22 @@ def _lane(town: Town, number: int) -> Lane:
 # --- many drives ----------------------------------------------------------------------------------------------------
 
 
-def record_all(
-    town: TownSettings,
-    recording: RecordingSettings,
-    seeds: Sequence[int],
-    folder: Path,
-    processes: int = 1,
-    progress: Callable[[int, int], None] | None = None,
-) -> list[Path]:
+def record_flow(
+    town: TownSettings, recording: RecordingSettings, seeds: Sequence[int], folder: Path
+) -> Flow[list[Path]]:
     """Record the drives of `seeds` that `folder` lacks, as `folder/<seed:08d>`; returns all paths in order of `seeds`.
 
-    Whole drives only are ever seen there, so that a killed call can simply be repeated. The result does not depend on
-    `processes`. `progress` gets (drives done, drives in all). Raises BadInputError for settings that cannot be met.
+    Whole drives only are ever seen there, so that a killed run can simply be repeated. Raises BadInputError for
+    settings that cannot be met.
     """
-    if processes < 1:
-        raise BadInputError(f"processes: got {processes}; at least 1 is needed")
     paths = [folder / drive_name(seed) for seed in seeds]
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with alone(folder / ".lock"):
-            _sweep(folder)  # what calls that were killed have left
-            jobs = [(town, recording, seed, path) for seed, path in zip(seeds, paths, strict=True) if not path.exists()]
-            done = len(paths) - len(jobs)
-            report = progress or (lambda *_: None)
-            report(done, len(paths))
-            with Pool(min(processes, len(jobs))) as pool:
-                for number, _ in enumerate(pool.results(_record, jobs), done + 1):
-                    report(number, len(paths))
-            _sweep(folder)  # and children of this one
-    except OSError as error:
-        if error.errno not in WRITE_ERRORS:
-            raise
-        raise BadInputError(cannot_write(folder, error)) from error
+    folder.mkdir(parents=True, exist_ok=True)
+    with FileLock(folder / ".lock"):
+        _sweep(folder)  # what runs that were killed have left
+        missing = [(seed, path) for seed, path in zip(seeds, paths, strict=True) if not path.exists()]
+        tasks = [Task(RECORD, record_drive, (town, recording, seed, path)) for seed, path in missing]
+        yield Batch(tasks, before=len(paths) - len(tasks))
+        _sweep(folder)  # and workers of this one
     return paths
 
 
@@ -203,5 +187,6 @@ def _sweep(folder: Path) -> None:
         shutil.rmtree(left)
 
 
-def _record(town: TownSettings, recording: RecordingSettings, seed: int, path: Path) -> None:
+def record_drive(town: TownSettings, recording: RecordingSettings, seed: int, path: Path) -> None:
+    """Record one drive and write it as `path`."""
     write_episode(record_episode(town, recording, seed), path)

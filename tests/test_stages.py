@@ -3,7 +3,7 @@
 import pytest
 
 from study.config import Cell, StudySettings
-from study.cost import Cost, cell_cost, clock, data_cost, size, total
+from study.stages import Cost, cell_cost, clock, data_cost, size, total
 
 
 def changed(**groups):

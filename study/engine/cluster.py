@@ -1,0 +1,346 @@
+"""Engines of Dask distributed, which supervises every process of a study: this machine's cores, or a cluster.
+
+Worker processes that die are restarted, and their tasks run again elsewhere. Each task computes in one thread of one
+worker, so results do not depend on how many workers there are. Workers exit when this process does.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import logging
+import os
+import signal
+import time
+import uuid
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from functools import partial
+from multiprocessing import resource_tracker
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import Any, Self
+from urllib.parse import urlsplit
+
+import dask
+from distributed import (
+    CancelledError,
+    Client,
+    Future,
+    KilledWorker,
+    Nanny,
+    Scheduler,
+    Security,
+    SpecCluster,
+    get_worker,
+)
+
+from study.config import BadInputError, masked, one_of, read_yaml
+from study.engine.flows import TRIES
+from study.engine.tasks import Failure, Hear, perform
+from study.stages import Task
+
+CONNECT = 10.0  # [s] a scheduler has to answer in
+SIZE = 5.0  # [s] between two looks at how many workers there are
+GPU = "GPU"  # the resource that a worker with a GPU has one of
+CERTIFICATES = {"tls_ca_file": "ca.pem", "tls_client_cert": "cert.pem", "tls_client_key": "key.pem"}
+JOB_CLASSES = ("SLURMCluster", "PBSCluster", "SGECluster", "LSFCluster", "OARCluster", "MoabCluster", "HTCondorCluster")
+CONFIGURATION = {
+    "distributed.scheduler.allowed-failures": TRIES - 1,  # deaths of a worker with a task, before the task is given up
+    "distributed.scheduler.worker-saturation": 1.0,
+    "distributed.worker.daemon": False,
+    "distributed.worker.memory.target": False,
+    "distributed.worker.memory.spill": False,
+    "distributed.worker.memory.pause": False,
+    "distributed.worker.memory.terminate": False,
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.large-graph-warning-threshold": "1GB",  # latents travel as arguments
+    "distributed.admin.tick.limit": "1h",  # a busy machine is no news
+}
+
+
+class EngineLostError(BadInputError):
+    """The scheduler is gone; once there is one again, the same command continues."""
+
+
+class DaskEngine:
+    """Runs tasks on the workers of a Dask scheduler."""
+
+    def __init__(self, client: Client, close: Callable[[], None], address: str) -> None:
+        """Take a connected client; `close` ends what was started for it."""
+        self._client, self._close, self._address = client, close, address
+        self._topic = f"study-{uuid.uuid4().hex}"
+        self._futures: dict[int, Future[Any]] = {}
+        self._messages: SimpleQueue[tuple[str, int, Any]] = SimpleQueue()
+        self._looked, self._slots, self._gpus = 0.0, 0, 0
+        client.subscribe_topic(self._topic, self._take)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:  # else the process is about to exit, and its workers with it: closing would wait for them
+            self._close()
+
+    def _take(self, event: tuple[float, tuple[int, tuple[Any, ...]]]) -> None:
+        number, values = event[1]
+        self._messages.put(("event", number, values))
+
+    def _look(self) -> None:
+        if time.monotonic() - self._looked > SIZE or not self._slots:
+            with self._lost():
+                workers = self._client.scheduler_info(n_workers=-1)["workers"].values()
+            self._gpus = int(sum(worker["resources"].get(GPU, 0) for worker in workers))
+            # A worker with a GPU trains there, and leaves the rest to the others where there are any.
+            plain = sum(worker["nthreads"] for worker in workers if not worker["resources"].get(GPU))
+            self._slots = plain or sum(worker["nthreads"] for worker in workers)
+            self._looked = time.monotonic()
+
+    def slots(self) -> int:
+        """Return how many tasks can run at a time, just now."""
+        self._look()
+        return self._slots
+
+    def gpus(self) -> int:
+        """Return how many GPUs the workers have, just now."""
+        self._look()
+        return self._gpus
+
+    def workers_see(self, file: Path) -> bool:
+        """Return whether every worker sees this file under this path, as in a shared folder."""
+        with self._lost():
+            return bool(seen := self._client.run(partial(_sees, str(file)))) and all(seen.values())
+
+    def submit(self, number: int, task: Task) -> None:
+        """Hand the task to the scheduler."""
+        with self._lost():
+            future = self._client.submit(
+                _run_on_worker,
+                self._topic,
+                number,
+                task,
+                key=f"{task.stage.name}-{uuid.uuid4().hex}",
+                pure=False,
+                priority=-number,
+                resources={GPU: 1} if task.accelerated and self._gpus else None,
+            )
+        self._futures[number] = future
+        future.add_done_callback(lambda _: self._messages.put(("end", number, None)))
+
+    def cancel(self, numbers: Collection[int]) -> None:
+        """Forget tasks: those that wait are dropped, those that run do so in vain."""
+        for number in numbers:
+            self._futures.pop(number, None)  # Dask releases what nobody holds
+
+    def wait(self, seconds: float, hear: Hear) -> list[tuple[int, Any]]:
+        """Return what has ended since; see `Engine`. Raises EngineLostError when the scheduler is gone."""
+        ended: list[tuple[int, Any]] = []
+        deadline = time.monotonic() + seconds
+        while not ended or not self._messages.empty():
+            try:
+                kind, number, values = self._messages.get(timeout=max(0.0, deadline - time.monotonic()))
+            except Empty:
+                break
+            if kind == "event":
+                hear(number, *values)
+            elif (future := self._futures.pop(number, None)) is not None:
+                ended.append((number, self._value(future)))
+        if self._client.status not in ("running", "connecting"):
+            raise self._gone()
+        return ended
+
+    def _value(self, future: Future[Any]) -> Any:
+        try:
+            return future.result()
+        except KilledWorker:
+            reason = f"the process that ran it was killed {TRIES} times; is memory short?"
+            return Failure(reason, transient=False)
+        except CancelledError:
+            raise self._gone() from None
+        except Exception as error:  # noqa: BLE001 - what kept the task from running at all, such as a missing package
+            return Failure(f"{type(error).__name__}: {error}", transient=False)
+
+    @contextmanager
+    def _lost(self) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, RuntimeError, CancelledError) as error:
+            raise self._gone() from error
+
+    def _gone(self) -> EngineLostError:
+        return EngineLostError(
+            f"the scheduler at {self._address} went away; nothing that was finished is lost: start it again, with its "
+            "workers, and give the same command"
+        )
+
+
+def _run_on_worker(topic: str, number: int, task: Task) -> Any:
+    worker = get_worker()
+    return perform(task, lambda *values: worker.log_event(topic, (number, values)))
+
+
+def _sees(file: str) -> bool:
+    return Path(file).is_file()
+
+
+# --- this machine ---------------------------------------------------------------------------------------------------
+
+
+def local_engine(workers: int, scratch: Path, gpus: Sequence[str] = ()) -> DaskEngine:
+    """Start workers on this machine, behind a scheduler that listens on loopback.
+
+    Args:
+        workers: processes of one task at a time each; one more is started for each GPU.
+        scratch: folder for the workers' temporary files.
+        gpus: CUDA's names of the GPUs to use, such as "0".
+    """
+    _configure()
+    options = {
+        "nthreads": 1,
+        "memory_limit": 0,
+        "local_directory": str(scratch.absolute()),
+        "host": "127.0.0.1",
+        "dashboard": False,
+        "silence_logs": logging.CRITICAL,
+    }
+    # Only workers with a GPU may see it: what computes on a CPU must not open one by chance.
+    kinds = [{"resources": {GPU: 1}, "env": {"CUDA_VISIBLE_DEVICES": name}} for name in gpus]
+    kinds += [{"env": {"CUDA_VISIBLE_DEVICES": ""}} if gpus else {} for _ in range(workers)]
+    address = {"host": "127.0.0.1", "port": 0, "dashboard": False, "dashboard_address": "127.0.0.1:0"}
+    resource_tracker.ensure_running()  # its start would lift the mask again
+    # Ctrl-C reaches every process of a terminal, and is this one's to answer. The threads that are born here never see
+    # it, nor do the workers that they start, from their first moment on.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        cluster = SpecCluster(
+            workers={index: {"cls": Nanny, "options": {**options, **kind}} for index, kind in enumerate(kinds)},
+            scheduler={"cls": Scheduler, "options": address},
+            silence_logs=logging.CRITICAL,
+        )
+        client = Client(cluster, timeout=60)
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    return DaskEngine(client, partial(_close, client, cluster), cluster.scheduler_address)
+
+
+def _close(client: Client, cluster: Any = None) -> None:
+    with suppress(OSError, TimeoutError):
+        client.close()
+        if cluster is not None:
+            cluster.close()
+
+
+def _configure() -> None:
+    """Set Dask's configuration for this process and the workers that it starts."""
+    dask.config.set(CONFIGURATION)
+    for name in ("distributed", "tornado", "asyncio", "bokeh"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+
+
+# --- many machines --------------------------------------------------------------------------------------------------
+
+
+def cluster_engine(cluster: str, certificates: Path | None = None) -> DaskEngine:
+    """Connect to a scheduler's address, or start the dask-jobqueue cluster that a YAML file describes.
+
+    Raises BadInputError for an address that does not answer or is not secured, certificates that do not match, and a
+    file that cannot be used.
+    """
+    _configure()
+    if cluster.endswith((".yaml", ".yml")):
+        return _job_engine(Path(cluster))
+    check_address(cluster)
+    security = _security(certificates) if certificates else None
+    try:
+        client = Client(cluster, security=security, timeout=CONNECT, set_as_default=False)
+    except (OSError, ValueError, TypeError, RuntimeError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise BadInputError(
+            f"no Dask scheduler answers at {masked(cluster)} within {CONNECT:.0f} s ({reason}); start one with 'dask "
+            "scheduler', check address and port, and for tls:// that --certificates holds its certificates"
+        ) from None
+    return DaskEngine(client, partial(_close, client), masked(cluster))
+
+
+def check_address(address: str) -> None:
+    """Raise BadInputError for an address that is none, or whose traffic could be read or forged by others."""
+    parts = urlsplit(address)
+    if parts.scheme not in {"tcp", "tls"} or not parts.hostname:
+        raise BadInputError(
+            f"--cluster is '{masked(address)}'; give a scheduler's address such as tls://host:8786, or a YAML file"
+        )
+    if parts.scheme == "tcp" and not _is_loopback(parts.hostname):
+        raise BadInputError(
+            f"{masked(address)} is not on this machine and not encrypted: tasks are Python objects, and whoever can "
+            "send them can run code; start the scheduler with TLS and give tls://..., with --certificates"
+        )
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def _security(folder: Path) -> Security:
+    files = {name: folder / file for name, file in CERTIFICATES.items()}
+    if missing := [file.name for file in files.values() if not file.is_file()]:
+        raise BadInputError(
+            f"{folder} has no {', '.join(missing)}; --certificates needs {', '.join(CERTIFICATES.values())}"
+        )
+    return Security(require_encryption=True, **{name: str(file) for name, file in files.items()})
+
+
+def _job_engine(path: Path) -> DaskEngine:
+    content = read_yaml(path)
+    if unknown := sorted(content.keys() - {"class", "arguments", "workers"}):
+        raise BadInputError(f"{path}: unknown setting '{unknown[0]}'; choose from class, arguments, workers")
+    name, arguments, workers = content.get("class"), content.get("arguments", {}), content.get("workers", 1)
+    if name not in JOB_CLASSES:
+        raise one_of(f"{path}: class", str(name), JOB_CLASSES)
+    if not isinstance(arguments, Mapping) or not isinstance(workers, int) or workers < 1:
+        raise BadInputError(f"{path}: 'arguments' must be a mapping and 'workers' a number of 1 or more")
+    try:
+        import dask_jobqueue  # noqa: PLC0415 - an extra that only batch systems need
+    except ModuleNotFoundError:
+        raise BadInputError(f"{path} needs dask-jobqueue: pip install 'study[cluster]'") from None
+    return start_jobs(getattr(dask_jobqueue, name), dict(arguments), workers, str(path))
+
+
+def start_jobs(kind: Callable[..., Any], arguments: Mapping[str, Any], workers: int, source: str) -> DaskEngine:
+    """Start a scheduler here and ask a batch system for workers, over TLS with certificates made for this run."""
+    folder = Path("data") / "tmp" / "certificates"
+    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+    defaults = {
+        "cores": 1,
+        "processes": 1,
+        "memory": "8GB",
+        "security": Security.temporary(),
+        "protocol": "tls://",
+        "shared_temp_directory": str(folder.absolute()),
+        "silence_logs": logging.CRITICAL,
+    }
+    if arguments.keys() & {"security", "protocol"}:
+        raise BadInputError(f"{source}: leave out 'security' and 'protocol'; workers always connect over TLS")
+    try:
+        cluster = kind(**{**defaults, **arguments})
+        cluster.scale(workers)
+        client = Client(cluster, timeout=CONNECT)
+    except (OSError, TypeError, ValueError, RuntimeError, ImportError) as error:
+        reason = " ".join(str(error).split())[:300]
+        raise BadInputError(f"{source}: {kind.__name__} cannot be started with these arguments: {reason}") from None
+    return DaskEngine(client, partial(_close, client, cluster), cluster.scheduler_address)
+
+
+def visible_gpus(device: str) -> list[str]:
+    """Return CUDA's names of the GPUs that `--device` asks for: all of them for auto and cuda, one for cuda:N."""
+    if device == "cpu":
+        return []
+    import torch  # noqa: PLC0415 - a second's work that a CPU run does not need
+
+    names = os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")
+    count = torch.cuda.device_count()
+    listed = names[:count] if len(names) >= count and names != [""] else [str(number) for number in range(count)]
+    if device.startswith("cuda:"):
+        return listed[int(device.removeprefix("cuda:")) :][:1]
+    return listed

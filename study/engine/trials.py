@@ -1,0 +1,88 @@
+"""Which cell next: Optuna decides, by its public `ask` and `tell`, in the one process that runs the sweep.
+
+A trial is one run of a cell; its only parameter is the cell's label with its key, as one string. Optuna is never the
+truth about what is done: MLflow is. So whatever an earlier process left open is closed at the start.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+import optuna
+from optuna.exceptions import StorageInternalError
+from optuna.trial import Trial, TrialState
+from sqlalchemy.exc import SQLAlchemyError  # comes with optuna, which lets some of them through
+
+from study.config import BadInputError, masked
+
+PARAMETER = "cell"
+
+
+class Trials:
+    """The cells of one plan, as trials of an Optuna study in a SQLite file. One process at a time may use a file."""
+
+    def __init__(self, file: Path, study: str, labels: Mapping[str, str], order: Iterable[str]) -> None:
+        """Queue the cells of these keys in this order. Raises BadInputError when the file cannot be used."""
+        optuna.logging.set_verbosity(optuna.logging.ERROR)
+        self._file = file
+        self._words = {key: f"{label} {key}" for key, label in labels.items()}
+        self._trials: dict[str, Trial] = {}
+        with self._guard():
+            file.parent.mkdir(parents=True, exist_ok=True)
+            self._study = optuna.create_study(
+                study_name=study, storage=f"sqlite:///{file}", direction="maximize", load_if_exists=True
+            )
+            self._close_left()
+            keys = list(order)
+            for key in keys:
+                self._study.enqueue_trial({PARAMETER: self._words[key]})
+        self._left = len(keys)
+
+    def _close_left(self) -> None:
+        """Close what an earlier process has left open."""
+        for trial in self._study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
+            self._study.tell(trial.number, state=TrialState.FAIL)
+        for _ in self._study.get_trials(deepcopy=False, states=(TrialState.WAITING,)):
+            self._study.tell(self._study.ask(), state=TrialState.PRUNED)
+
+    def ask(self) -> str | None:
+        """Return the key of the cell to run next, or None when there is none."""
+        if not self._left:
+            return None  # Optuna would make one up
+        self._left -= 1
+        with self._guard():
+            trial = self._study.ask()
+            word = trial.suggest_categorical(PARAMETER, list(self._words.values()))
+        key = next(key for key, each in self._words.items() if each == word)
+        self._trials[key] = trial
+        return key
+
+    def finish(self, key: str, score: float) -> None:
+        """Tell that a cell is finished; the score is for those who look at Optuna's dashboard."""
+        with self._guard():
+            self._study.tell(self._trials.pop(key), score)
+
+    def fail(self, key: str, reason: str) -> None:
+        """Tell that a cell has failed."""
+        with self._guard():
+            trial = self._trials.pop(key)
+            trial.set_user_attr("reason", masked(reason)[:2000])
+            self._study.tell(trial, state=TrialState.FAIL)
+
+    def stop(self) -> None:
+        """Close what is open: the sweep was stopped."""
+        with self._guard():
+            self._close_left()
+
+    @contextmanager
+    def _guard(self) -> Iterator[None]:
+        try:
+            yield
+        except (StorageInternalError, SQLAlchemyError, OSError) as error:
+            reason = " ".join(str(error.__cause__ or error).partition("\n[SQL")[0].split())[:300]
+            raise BadInputError(
+                f"{self._file}, where Optuna keeps the order of the cells, cannot be used: {reason}; make room, or "
+                "move the file away (it holds no results)"
+            ) from None
