@@ -23,9 +23,10 @@ from study.config import CEILING, BadInputError, cell_key
 from study.data import data_flow
 from study.engine.flows import run_flow
 from study.frames import Frames, FrameStore, open_frames
+from study.job import CellJob
 from study.products import Arrays, read_product, write_product
 from study.provenance import provenance
-from study.result import NO_SEED, CellJob, CellResult
+from study.result import NO_SEED, CellResult
 from study.stages import ENCODER, LATENTS, POLICY, RESULT, Batch, Flow, Task, Work
 
 PROBED = ("speed", "light", "lead_gap")  # columns of the labels that reports probe the latents for

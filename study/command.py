@@ -9,8 +9,8 @@ import os
 import shlex
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+import threading
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -21,6 +21,9 @@ from pydantic.fields import FieldInfo
 from study.config import DEFAULT_TRACKING, BadInputError, Grid, StudySettings, masked
 
 EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
+EXIT_AGAIN = 75  # of study.train: cells are left, the same command continues
+EXITS_AT_ONCE = (EXIT_INTERRUPTED, EXIT_AGAIN)
+STOP_SECONDS = 2.0  # that a stopped command has to come to an end by itself
 # A disk that is full, a folder that cannot be: the user can change that, anything else is a fault.
 WRITE_ERRORS = (
     *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG),
@@ -117,7 +120,7 @@ def run(main: Callable[[Sequence[str]], int]) -> NoReturn:
     except BrokenPipeError:  # the reader, such as `head`, has seen enough
         sys.stderr.close()
         code = 0
-    if _interrupts.stopped:  # at once: Dask would wait for its workers, which end by themselves
+    if code in EXITS_AT_ONCE:  # Dask would wait for its workers, which end by themselves
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
@@ -133,60 +136,59 @@ def cannot_write(path: Path, error: OSError) -> str:
 
 
 def stoppable(work: Callable[[], int], command: str) -> int:
-    """Do the work and return its exit code; Ctrl-C, or a batch system's SIGTERM, ends it with how to go on."""
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    """Do the work and return its exit code; Ctrl-C, or a batch system's SIGTERM, ends it with how to go on.
+
+    A signal does not break into what runs, which may be a library's write: the work asks `check_stopped` now and then.
+    Work that does not ask in time is left where it is, as if it had been killed, which every part of a study survives.
+    """
+    stop = _Stop(command)
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGALRM)
+    before = {number: signal.getsignal(number) for number in numbers}
     for number, handler in before.items():
         if handler is not signal.SIG_IGN:  # as nohup and shells leave it for what they start behind
-            signal.signal(number, _interrupts)
+            signal.signal(number, stop.press)
+    _stops.append(stop)
     try:
         return work()
     except KeyboardInterrupt:
-        _interrupts.stopped = True
-        print(f"\nStopped. Nothing that was finished is lost. To go on: {command}", file=sys.stderr)
+        stop.leave(at_once=False)
         return EXIT_INTERRUPTED
     finally:
-        _interrupts.pressed = False
+        _stops.remove(stop)
+        stop.timer.cancel()
         for number, handler in before.items():
-            if signal.getsignal(number) is _interrupts:  # else the work wants to be left alone until its end
-                signal.signal(number, handler)
+            signal.signal(number, handler)
 
 
-class _Interrupts:
-    """A signal handler that remembers, and raises KeyboardInterrupt unless it is held."""
+class _Stop:
+    """Remembers that the user wants to stop, and sees to it that this happens soon."""
 
-    pressed = False
-    stopped = False  # a command has ended by it
-    held = 0
+    def __init__(self, command: str) -> None:
+        self.command, self.pressed = command, False
+        self.timer = threading.Timer(STOP_SECONDS, self.leave)
+        self.timer.daemon = True
 
-    def __call__(self, *_: object) -> None:
-        self.pressed = True
-        self.check()
+    def press(self, *_: object) -> None:
+        if not self.pressed:  # a second Ctrl-C changes nothing
+            self.pressed = True
+            self.timer.start()
 
-    def check(self) -> None:
-        if self.pressed and not self.held:
-            raise KeyboardInterrupt
+    def leave(self, *, at_once: bool = True) -> None:
+        """Say how to go on, and end the process when that must be `at_once`."""
+        show_cursor = "\x1b[?25h" if sys.stderr.isatty() else ""
+        print(f"{show_cursor}\nStopped. Nothing that was finished is lost. To go on: {self.command}", file=sys.stderr)
+        if at_once:
+            sys.stderr.flush()
+            os._exit(EXIT_INTERRUPTED)
 
 
-_interrupts = _Interrupts()
-
-
-@contextmanager
-def unbroken() -> Iterator[None]:
-    """Under `stoppable`, have a Ctrl-C wait for the end of the block, which must be short.
-
-    An exception that rises anywhere in a library may be written out, or dropped: in a finaliser Python does the latter.
-    """
-    _interrupts.held += 1
-    try:
-        yield
-    finally:
-        _interrupts.held -= 1
-    check_stopped()
+_stops: list[_Stop] = []
 
 
 def check_stopped() -> None:
-    """Raise KeyboardInterrupt after a Ctrl-C or SIGTERM under `stoppable`, whether or not it was raised before."""
-    _interrupts.check()
+    """Raise KeyboardInterrupt after a Ctrl-C or SIGTERM under `stoppable`."""
+    if any(stop.pressed for stop in _stops):
+        raise KeyboardInterrupt
 
 
 def typed(module: str, args: Sequence[str]) -> str:

@@ -19,7 +19,7 @@ from study.config import BadInputError
 def trainer(device: torch.device, epochs: int, load: str, remedy: str, **options: Any) -> Iterator[lightning.Trainer]:
     """A Trainer for `epochs` on a device; `options` are Lightning's own.
 
-    Ctrl-C in here stays one. Raises BadInputError when the device has too little memory for the `load`, with the
+    Raises BadInputError when the device has too little memory for the `load`, with the
     `remedy`.
     """
     logger = logging.getLogger("lightning.pytorch")
@@ -41,9 +41,5 @@ def trainer(device: torch.device, epochs: int, load: str, remedy: str, **options
             )
     except torch.OutOfMemoryError as error:
         raise BadInputError(f"{device} has too little memory for {load} ({error}); {remedy}") from error
-    except SystemExit as error:
-        if isinstance(error.__context__, KeyboardInterrupt):  # Lightning makes Ctrl-C an exit with code 1
-            raise KeyboardInterrupt from None
-        raise
     finally:
         logger.setLevel(level)

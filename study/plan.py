@@ -27,7 +27,7 @@ from study.config import (
 )
 from study.data import DATA, drives_folder, frames_folder
 from study.imported import Imported, open_import
-from study.result import CellJob
+from study.job import CellJob
 from study.stages import Cost, Work, data_cost
 
 if TYPE_CHECKING:

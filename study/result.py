@@ -11,7 +11,6 @@ import numpy as np
 import pandas as pd
 
 from study.config import CEILING, BadInputError, Cell, Grid, StudySettings, cell_key
-from study.imported import Imported
 from study.products import Arrays, read_product, write_product
 
 FORMAT_VERSION = 1
@@ -20,27 +19,6 @@ TABLE_COLUMNS = ("sweep", "heads", "fraction", "encoder_seed", *CURVE_COLUMNS)
 NO_SEED = -1  # policy_seed of rows that belong to the encoder
 ARRAYS = ("encoder", "policies", "samples", "predictions")
 HEAD = "cell.json"
-
-
-@dataclass(frozen=True)
-class CellJob:
-    """All that training a cell needs to know, on any machine.
-
-    `frames` is the frame store's folder and `drives` that of the drives it was made from, `imported` when these are not
-    our town's; where the frames are missing they are made from them. `scratch` holds checkpoints and the products of
-    finished stages. `device` is "auto" or a torch device. Folders are relative to the working folder of whoever runs.
-    """
-
-    cell: Cell
-    key: str
-    settings: StudySettings
-    policy_seeds: int
-    frames: Path
-    drives: Path
-    scratch: Path
-    device: str = "auto"
-    threads: int = 1
-    imported: Imported | None = None
 
 
 @dataclass(frozen=True)

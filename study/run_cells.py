@@ -6,12 +6,11 @@ import argparse
 import json
 import os
 import shutil
-import signal
 import sys
 import tempfile
 import threading
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, ParamSpec, Self, TypeVar
 
@@ -20,7 +19,7 @@ from tenacity import RetryCallState, Retrying, retry_if_exception_type, stop_aft
 
 from study.card import card_files, source_drives
 from study.cell import cell_flow, product_folders
-from study.command import EXIT_FAILED, unbroken
+from study.command import EXIT_FAILED, check_stopped
 from study.config import BadInputError, masked
 from study.data import DATA, data_flow, describe_data
 from study.display import Display
@@ -38,7 +37,7 @@ from study.store import SQLITE, TrackerLostError
 from study.tracking import CellRun, Tracker
 
 PATIENCE, RETRY = 600.0, 3.0  # [s] a lost server is waited for, and between two tries
-END = 4.0  # [s] that a stop takes at most, whatever the servers do
+END = 1.5  # [s] that a store has to be told of a stop
 SCORE = "acceleration_accuracy"
 
 P = ParamSpec("P")
@@ -175,8 +174,7 @@ class Committing:
 
     def next_flow(self) -> tuple[str, Flow[Any]] | None:
         """Return the flow of the cell that Optuna names, or None when there is none left."""
-        with self._calm():
-            key = self._trials.ask()
+        key = self._trials.ask()
         return None if key is None else (key, cell_flow(self._jobs[key], one_share=self._one_share))
 
     def started(self, name: str, host: str, process: int) -> None:
@@ -214,8 +212,7 @@ class Committing:
         result, network = value
         run = self._runs.pop(name)
         self._patiently(self._tracker.commit, run, result, network)
-        with self._calm():
-            self._trials.finish(name, _score(result))
+        self._trials.finish(name, _score(result))
         for folder in product_folders(self._jobs[name].scratch, name):
             shutil.rmtree(folder, ignore_errors=True)
         self._display.finish(name)
@@ -226,8 +223,7 @@ class Committing:
         if name not in self._runs:  # before anything of it ran
             self.started(name, "", os.getpid())
         self._patiently(self._tracker.fail, self._runs.pop(name), failure.reason, permanent=not failure.transient)
-        with self._calm():
-            self._trials.fail(name, failure.reason)
+        self._trials.fail(name, failure.reason)
         self._display.fail(name)
 
     def tick(self) -> None:
@@ -239,37 +235,30 @@ class Committing:
         self._patiently(self._tracker.close_sweep, self._sweep_run, "FAILED" if self._failed else "FINISHED")
         return self._failed
 
-    def _calm(self) -> AbstractContextManager[None]:
-        """Have Ctrl-C wait while files are written. For a server it does not, which may be long in answering."""
-        return nullcontext() if self._patience else unbroken()
-
     def _patiently(self, action: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
         """Do something that can be done again, and wait for a server that is away meanwhile."""
 
         def say(state: RetryCallState) -> None:
+            check_stopped()
             if state.attempt_number == 1 and state.outcome is not None:
                 minutes = self._patience / 60
                 self._display.say(f"{state.outcome.exception()}; trying again for {minutes:.0f} minutes")
 
-        with self._calm():
-            return Retrying(
-                retry=retry_if_exception_type(TrackerLostError),
-                stop=stop_after_delay(self._patience),
-                wait=wait_fixed(RETRY),
-                before_sleep=say,
-                reraise=True,
-            )(action, *args, **kwargs)
+        return Retrying(
+            retry=retry_if_exception_type(TrackerLostError),
+            stop=stop_after_delay(self._patience),
+            wait=wait_fixed(RETRY),
+            before_sleep=say,
+            reraise=True,
+        )(action, *args, **kwargs)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """When something has cut the sweep short, say so in the store, in a few seconds."""
+        """When something has cut the sweep short, say so in the store; a stop does not wait long for that."""
         if kind is None:
             return
-        for number in (signal.SIGINT, signal.SIGTERM):  # a second Ctrl-C changes nothing
-            signal.signal(number, signal.SIG_IGN)
-        # A thread that may be left behind: a server that does not answer must not hold up the end.
         release = threading.Thread(target=self._release, daemon=True)
         release.start()
         release.join(END)

@@ -24,22 +24,21 @@ from typing import TYPE_CHECKING
 from filelock import FileLock, Timeout
 
 from study.cell import cell_flow, product_folders
-from study.command import EXIT_FAILED, EXIT_INTERRUPTED, Parser, run, stoppable, typed
+from study.command import EXIT_AGAIN, EXIT_FAILED, EXIT_INTERRUPTED, Parser, run, stoppable, typed
 from study.config import BadInputError
 from study.data import DATA, data_flow
 from study.display import Display
 from study.engine.flows import SilentListener, run_flow, run_flows
 from study.engine.inline import InlineEngine
 from study.engine.tasks import Failure
+from study.job import CellJob
 from study.plan import Plan, add_machine_options, add_plan_options, cell_jobs, check_machine, given_plan
 from study.provenance import cores
-from study.result import CellJob, CellResult
+from study.result import CellResult
 from study.stages import Batch, Flow, cell_cost
 
 if TYPE_CHECKING:  # Dask, which may be missing
     from study.engine.cluster import DaskEngine
-
-EXIT_AGAIN = 75  # cells are left: the same command goes on
 
 
 def parser() -> Parser:
@@ -68,7 +67,6 @@ def main(args: Sequence[str]) -> int:
     plan = given_plan(options)
     check_machine(options)
     if limit is not None:
-        signal.signal(signal.SIGALRM, signal.default_int_handler)
         signal.setitimer(signal.ITIMER_REAL, limit)
     try:
         code = stoppable(lambda: train(plan, options.out, options), typed("study.train", args))

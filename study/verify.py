@@ -25,10 +25,11 @@ from study.config import BadInputError, Cell, StudySettings, cell_key, one_of
 from study.data import DATA, data_flow
 from study.display import Display
 from study.engine.flows import run_flow
+from study.job import CellJob
 from study.plan import Plan, add_plan_options, given_plan, look_up
 from study.points import scores_of
 from study.provenance import cores
-from study.result import ARRAYS, CURVE_COLUMNS, CellJob, CellResult
+from study.result import ARRAYS, CURVE_COLUMNS, CellResult
 from study.stages import cell_cost
 
 EXIT_DIFFERS = 1
