@@ -55,7 +55,13 @@ def run_cells(plan: Plan, options: argparse.Namespace, tracker: Tracker) -> dict
     title = f"{plan.grid.name} ({plan.profile})"
     order = sorted(waiting, key=lambda key: -costs[key])
     with (
-        Display(title, costs, labels, 0.0 if ready or not waiting else plan.data_cost.seconds, plan.works) as display,
+        Display(
+            title,
+            costs | dict.fromkeys(given_up, 0.0),
+            labels,
+            0.0 if ready or not waiting else plan.data_cost.seconds,
+            plan.works,
+        ) as display,
         temporary_folder(DATA),
         start_engine(options) if waiting else InlineEngine() as engine,
     ):

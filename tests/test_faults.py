@@ -6,21 +6,18 @@ import re
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from collections import Counter
 from contextlib import suppress
-from typing import ClassVar
 
 import pytest
 
-from running import FOUR, ROOT, Running, Store, check_like, command, leftovers, store, working_folder
+from running import FOUR, ROOT, Running, Store, check_like, command, store, working_folder
 from servers import TrackingServer
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.stress
 
 TWO = (*FOUR, "--heads", "[rec,full]")
-EIGHT = (*FOUR, "--encoder_seeds", "2")
 HINT = "Nothing that was finished is lost"
 
 
@@ -32,73 +29,78 @@ def entries(folder, pattern):
     return any(True for _ in folder.glob(pattern))
 
 
-def made(run, pattern):
-    """Whether children make data now, and something of that pattern is there."""
-    return run.of("data") and entries(run.folder, pattern)
+def has_cells(run):
+    """Whether a cell has started."""
+    return store(run.folder).cells()["RUNNING"] > 0
 
 
-SIGNS = {  # of a stage: something is going on
+SIGNS = {  # of a stage: something of it is going on
     "start": lambda run: True,
-    "record": lambda run: made(run, "data/episodes/*/*") and not entries(run.folder, "data/frames/*"),
-    "render": lambda run: made(run, "data/frames/.*.building"),
-    "cell": lambda run: run.of("cell"),
-    "commit": lambda run: "cells finished" in run.said and entries(run.folder, "data/cells/[!.]*"),
+    "engine": lambda run: run.of("worker"),
+    "record": lambda run: entries(run.folder, "data/episodes/*/*") and not entries(run.folder, "data/frames/*"),
+    "render": lambda run: entries(run.folder, "data/frames/.*.building"),
+    "encoder": lambda run: run.of("worker") and has_cells(run),
+    "policy": lambda run: run.of("worker") and entries(run.folder, "data/products/encoder-*") and has_cells(run),
+    "commit": lambda run: entries(run.folder, "data/products/policies-*"),
     "report": lambda run: "writing the report" in run.said,
 }
-
-
-def gone_by(run, stage):
-    """Whether the data came too fast to be hit: cells run, which are to be hit in their turn."""
-    return stage in {"record", "render"} and run.of("cell")
-
-
-LENGTH = {"start": 3.0, "record": 1.0, "render": 0.6, "cell": 0.8, "commit": 0.4, "report": 2.0}  # [s] after the sign
-STORM = 30  # kills at least
+LENGTH = {"start": 2.0, "engine": 2.0, "record": 1.0, "render": 0.6, "report": 2.0}  # [s] after the sign; else 0.8
 BLOWS = (  # stage, who is killed, how often; in the order in which a sweep gets there
-    (("start", "parent", 1), ("record", "parent", 1), ("record", "data", 2)),
-    (("render", "parent", 1), ("render", "data", 2)),
-    (
-        ("start", "parent", 1),
-        ("cell", "cell", 12),
-        ("cell", "server", 2),
-        ("cell", "parent", 2),
-    ),
-    (("commit", "parent", 2),),
-    (("report", "parent", 1),),
+    (("start", "client", 2), ("engine", "worker", 4), ("engine", "client", 2)),
+    (("record", "client", 2), ("record", "worker", 3)),
+    (("render", "client", 2), ("render", "worker", 3)),
+    (("encoder", "worker", 6), ("encoder", "client", 3), ("policy", "worker", 6), ("policy", "client", 3)),
+    (("commit", "client", 3), ("commit", "worker", 2)),
+    (("report", "client", 2),),
 )
+STORM = 40  # kills at least
+LATER = {"record": "data/frames/*/manifest.json", "render": "data/frames/*/manifest.json"}  # the stage is over
 
 
 def test_a_storm_of_kills_changes_nothing(quiet, tmp_path):
-    """SIGKILL at random moments of every stage, to the parent and to each kind of child."""
+    """SIGKILL at random moments of every stage, to the client and to workers."""
     rng = random.Random("storm")
     folder = working_folder(tmp_path)
-    run = Running(folder, *command(*FOUR), "--no-report")
-    kills, kept = Counter(), set()
+    kills, kept, run = Counter(), set(), None
     for phase in BLOWS:
         blows = [(stage, role) for stage, role, times in phase for _ in range(times)]
         rng.shuffle(blows)
         while blows:
             stage, role = blows[-1]
-            if not run.running:
+            if run is None or not run.running:
                 run = Running(folder, *command(*FOUR), *([] if stage == "report" else ["--no-report"]))
-            if not run.until(lambda run=run, stage=stage: SIGNS[stage](run) or gone_by(run, stage)):
-                if run.end() == 0 and stage != "report":  # nothing is left that could be hit there
-                    break
+
+            def over(stage=stage):
+                return stage in LATER and entries(folder, LATER[stage])
+
+            def sign(run=run, stage=stage, over=over):
+                return over() or SIGNS[stage](run)
+
+            if not run.until(sign):
+                if run.end() == 0 and stage != "report":  # every cell is finished: nothing is left to be hit there
+                    for path in ("mlruns/mlflow.db", "data/products", "data/encoders"):
+                        remove(folder / path)
+                    kept = set()
                 continue
-            if gone_by(run, stage):
-                break
-            time.sleep(rng.uniform(0, LENGTH[stage]))
-            if sent := run.send(signal.SIGKILL, *run.of(role)):
+            if over():
+                for path in folder.glob("data/frames/*"):
+                    remove(path)
+                run.send(signal.SIGKILL, *run.family())
+                run.end()
+                if stage == "record":
+                    remove(folder / "data/episodes")
+                continue
+            time.sleep(rng.uniform(0, LENGTH.get(stage, 0.8)))
+            if sent := run.send(signal.SIGKILL, *run.of(role)[:1]):
                 kills[f"{stage}: {role}"] += sent
                 blows.pop()
-            if role == "parent":
+            if role == "client":
                 run.end()
                 found = set(store(folder).folders())
                 assert kept <= found, "a finished cell was lost"
                 kept = found
-            if stage == "report" and not blows and kills.total() < STORM:
-                blows.append((stage, role))
-    run.end()
+    if run is not None:
+        run.end()
     run = Running(folder, *command(*FOUR))
     assert run.end() == 0, run.said
     print("kills", dict(kills), "runs of cells", dict(store(folder).cells()))
@@ -106,43 +108,90 @@ def test_a_storm_of_kills_changes_nothing(quiet, tmp_path):
     check_like(folder, quiet.folder)
 
 
-# --- one machine, one fault at a time -------------------------------------------------------------------------------
+def remove(path):
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
-def test_processes_that_stand_still_for_a_while_do_no_harm(quiet, tmp_path):
-    """A child is stopped until another cell is finished, then the parent until a child has ended."""
+# --- one fault at a time --------------------------------------------------------------------------------------------
+
+
+def test_a_client_that_stands_still_for_a_while_does_no_harm(quiet, tmp_path):
     folder = quiet.copy(tmp_path)
     run = Running(folder, *command(*TWO))
-    assert run.until(lambda: run.of("cell"))
-    still = run.of("cell")[0]
-    run.send(signal.SIGSTOP, still)
-    assert run.until(lambda: store(folder).results())
-    run.send(signal.SIGCONT, still)
-    assert run.until(lambda: run.of("cell"))
+    assert run.until(lambda: has_cells(run)), run.said
     run.send(signal.SIGSTOP, run.process.pid)
-    assert run.until(lambda: entries(folder, "data/cells/[!.]*") or not run.of("cell"))
+    time.sleep(15)
     run.send(signal.SIGCONT, run.process.pid)
     assert run.end() == 0, run.said
     check_like(folder, quiet.folder)
 
 
-def test_of_two_parents_started_at_once_one_works_and_one_is_told(quiet, tmp_path):
+def test_of_two_clients_started_at_once_one_works_and_one_is_told(quiet, tmp_path):
     folder = quiet.copy(tmp_path)
-    twins = [Running(folder, *command(*TWO)) for _ in range(2)]
+    twins = [Running(folder, *command(*TWO), log=tmp_path / f"log{number}") for number in range(2)]
     codes = [twin.end() for twin in twins]
     assert sorted(codes) == [0, 2]
-    assert "another sweep runs in this folder" in twins[codes.index(2)].said
+    assert "another sweep" in twins[codes.index(2)].said
+    check_like(folder, quiet.folder)
+
+
+def test_a_second_client_waits_when_told_to(quiet, tmp_path):
+    folder = quiet.copy(tmp_path)
+    twins = [Running(folder, *command(*TWO), "--wait", log=tmp_path / f"log{number}") for number in range(2)]
+    assert [twin.end() for twin in twins] == [0, 0]
+    assert sum("waiting for another sweep" in twin.said for twin in twins) == 1
+    check_like(folder, quiet.folder)
+
+
+POISON = """\
+# A cell that kills whoever trains its encoder.
+import importlib.util, os, signal, sys
+class Finder:
+    def find_spec(self, name, path=None, target=None):
+        if name != "study.autoencoder":
+            return None
+        sys.meta_path.remove(self)
+        spec = importlib.util.find_spec(name)
+        execute = spec.loader.exec_module
+        def exec_module(module):
+            execute(module)
+            train = module.train_encoder
+            def train_encoder(frames, heads, *rest, **named):
+                if heads == "rec+pred":
+                    os.kill(os.getpid(), signal.SIGKILL)
+                return train(frames, heads, *rest, **named)
+            module.train_encoder = train_encoder
+        spec.loader.exec_module = exec_module
+        return spec
+sys.meta_path.insert(0, Finder())
+"""
+
+
+def test_a_cell_that_kills_its_worker_is_given_up_and_the_others_finish(quiet, tmp_path):
+    folder = quiet.copy(tmp_path / "sweep")
+    (tmp_path / "sitecustomize.py").write_text(POISON)
+    path = os.pathsep.join([str(tmp_path), str(ROOT)])
+    run = Running(folder, *command(*FOUR), "--no-report", PYTHONPATH=path)
+    code = run.end()
+    assert code == 1, run.said
+    assert "failed: rec+pred 100% e0" in run.said
+    assert "killed 3 times" in run.said
+    assert len(store(folder).results()) == 3
+    run = Running(folder, *command(*FOUR))  # without the poison, the same command trains it
+    assert run.end() == 0, run.said
     check_like(folder, quiet.folder)
 
 
 def test_damaged_files_are_told_and_made_again(quiet, tmp_path):
-    """A frame, a checkpoint and a result that waits to be committed, damaged between two starts."""
+    """A frame, a checkpoint and a kept product, damaged between two starts."""
     folder = quiet.copy(tmp_path)
     (image,) = folder.glob("data/frames/*/encoder/images.npy")
-    shutil.copytree(quiet.folder / "data/encoders", folder / "data/encoders")
-    for key, at in store(quiet.folder).folders().items():
-        shutil.copytree(at, folder / "data/cells" / key)
-    damaged = [image, *folder.glob("data/encoders/*"), *folder.glob("data/cells/*/policies.safetensors")]
+    for name in ("encoders", "products"):
+        shutil.copytree(quiet.folder / "data" / name, folder / "data" / name)
+    damaged = [image, *folder.glob("data/encoders/*"), *folder.glob("data/products/*/weights.safetensors")]
     assert len(damaged) == 9
     for path in damaged:
         content = bytearray(path.read_bytes())
@@ -168,18 +217,17 @@ time.time_ns = lambda: _time_ns() + int(shift() * 1e9)
 
 
 def test_a_clock_that_jumps_changes_nothing(quiet, tmp_path):
-    """Five hours forth while a cell is trained, ten back while the next one is."""
+    """Five hours forth while a cell is trained, ten back later."""
     folder = quiet.copy(tmp_path / "sweep")
     (tmp_path / "sitecustomize.py").write_text(CLOCK)
     shift = tmp_path / "shift"
     shift.write_text("0")
     path = os.pathsep.join([str(tmp_path), str(ROOT)])
     run = Running(folder, *command(*TWO, "--workers", "1"), PYTHONPATH=path, SHIFT=str(shift))
-    for hours in (5, -5):
-        assert run.until(lambda: run.of("cell"))
-        first = run.of("cell")
-        move(shift, hours)
-        run.until(lambda first=first: not set(first) & set(run.of("cell")))
+    assert run.until(lambda: has_cells(run)), run.said
+    move(shift, 5)
+    assert run.until(lambda: store(folder).results()), run.said
+    move(shift, -5)
     assert run.end() == 0, run.said
     check_like(folder, quiet.folder)
 
@@ -192,25 +240,47 @@ def move(shift, hours):
 
 
 def test_a_stopped_sweep_ends_within_five_seconds_and_says_how_to_go_on(quiet, tmp_path):
-    """Ctrl-C, which reaches all processes of a terminal, and a batch system's SIGTERM."""
+    """Ctrl-C, which reaches all processes of a terminal, and a batch system's SIGTERM, at any moment from the start."""
     folder = quiet.copy(tmp_path)
-    long = ("--recording.duration", "3600", "--recording.warm_up", "0")  # drives that take minutes each
+    rng = random.Random("stop")
+    drives = ("--recording.duration", "3600", "--recording.warm_up", "0")  # drives that take minutes each
+    epochs = ("--encoder.epochs", "3000")
     for words, sign, how, whom in (
-        ((*TWO, *long), lambda run: run.of("data"), signal.SIGINT, "all"),
-        (TWO, SIGNS["cell"], signal.SIGTERM, "parent"),
-        (TWO, SIGNS["cell"], signal.SIGINT, "all"),
+        ((*TWO, *drives), lambda run: "cells finished" in run.said, signal.SIGINT, "all"),
+        ((*TWO, *drives), lambda run: run.of("worker"), signal.SIGINT, "all"),
+        ((*TWO, *drives), lambda run: entries(run.folder, "data/episodes/*/.lock"), signal.SIGTERM, "client"),
+        ((*TWO, *epochs), has_cells, signal.SIGTERM, "client"),
+        ((*TWO, *epochs), has_cells, signal.SIGINT, "all"),
+        ((*TWO, *epochs), lambda run: run.of("worker"), signal.SIGINT, "all"),
     ):
         run = Running(folder, *command(*words))
         assert run.until(lambda run=run, sign=sign: sign(run)), run.said
+        time.sleep(rng.uniform(0, 1))
         began = time.monotonic()
         run.send(how, *(run.family() if whom == "all" else [run.process.pid]))
-        assert run.end() == 130
+        assert run.end() == 130, run.said
         assert time.monotonic() - began < 5 * quiet.pace
         assert HINT in run.said
         assert "Traceback" not in run.said
     run = Running(folder, *command(*TWO))
     assert run.end() == 0, run.said
     check_like(folder, quiet.folder)
+
+
+def test_a_tracking_server_that_is_away_for_a_while_costs_nothing(quiet, tmp_path):
+    folder = quiet.copy(tmp_path / "sweep")
+    server = TrackingServer(tmp_path / "server", f"sqlite:///{tmp_path}/server.db")
+    try:
+        run = Running(folder, *command(*TWO), "--tracking", server.uri)
+        kept = Store(tmp_path / "server.db", tmp_path / "server/files")
+        assert run.until(lambda: kept.cells()["RUNNING"]), run.said
+        server.stop()
+        time.sleep(20)
+        server.start()
+        assert run.end() == 0, run.said
+        check_like(folder, quiet.folder, kept)
+    finally:
+        server.stop()
 
 
 # --- a full disk ----------------------------------------------------------------------------------------------------
@@ -248,101 +318,15 @@ def disk(tmp_path):
 
 def test_a_full_disk_is_told_at_every_stage_and_costs_nothing(quiet, disk, tmp_path):
     working_folder(disk.folder)
-    for stage in ("record", "render", "cell", "commit"):
+    for stage in ("record", "render", "encoder", "commit"):
         run = Running(disk.folder, *command(*TWO), log=tmp_path / "log")
         assert run.until(lambda run=run, stage=stage: SIGNS[stage](run)), run.said
         disk.fill()
-        assert run.end() in (1, 2)
-        assert re.search("No space left|disk is full", run.said), run.said
+        assert run.end() in (1, 2), run.said
+        assert re.search("No space left|disk is full|make room", run.said), run.said
         if stage in ("record", "render"):
             assert "Traceback" not in run.said
         disk.empty()
     run = Running(disk.folder, *command(*TWO), log=tmp_path / "log")
     assert run.end() == 0, run.said
     check_like(disk.folder, quiet.folder)
-
-
-# --- many machines --------------------------------------------------------------------------------------------------
-
-
-class Lab:
-    """Two sweeps started at once and a worker, each with a working folder of its own, around one queue and server."""
-
-    modules: ClassVar = {"one": "study.sweep", "two": "study.sweep", "three": "study.worker"}
-
-    def __init__(self, folder, quiet, *words):
-        self.where = {name: quiet.copy(folder / name) for name in self.modules}
-        self._words, self._rng = words, random.Random("lab")
-        self.kills = Counter()
-        self.crew = {name: self._begin(name) for name in self.modules}
-
-    def _begin(self, name):
-        return Running(self.where[name], sys.executable, "-m", self.modules[name], *EIGHT, *self._words)
-
-    def begin_again(self, name):
-        self.crew[name].end()
-        self.crew[name] = self._begin(name)
-
-    def await_cell(self, name):
-        assert self.crew[name].until(lambda: self.crew[name].of("cell")), self.crew[name].said
-
-    def kill(self, name, role):
-        """Kill a child, or a sweep's or worker's process."""
-        self.kills[f"{self.modules[name]}: {role}"] += self.crew[name].send(signal.SIGKILL, *self.crew[name].of(role))
-
-    def hit(self, name, role):
-        """The same soon after a cell was begun."""
-        self.await_cell(name)
-        time.sleep(self._rng.uniform(0, LENGTH["cell"]))
-        self.kill(name, role)
-
-
-def test_a_shared_queue_survives_kills_stops_and_lost_servers(quiet, postgres, tmp_path):
-    alone = shutil.copytree(quiet.folder, tmp_path / "alone")  # four of the eight are there
-    undisturbed = Running(alone, *command(*EIGHT))
-    queue, database = postgres.uri(), postgres.uri()
-    server = TrackingServer(tmp_path / "server", database)
-    kept = Store(database, tmp_path / "server/files")
-    grace = str(round(3 + 2 * quiet.pace))
-    lab = Lab(tmp_path, quiet, "--queue", queue, "--tracking", server.uri, "--grace", grace, "--workers", "1")
-    try:
-        lab.hit("one", "cell")
-        lab.hit("two", "cell")
-        lab.await_cell("three")
-        postgres.stop()
-        lab.kill("three", "cell")
-        server.stop()
-        time.sleep(2)
-        postgres.start()
-        server.start()
-
-        # One that has a cell stands still until the others have finished all.
-        lab.await_cell("two")
-        family = list(lab.crew["two"].family())
-        lab.crew["two"].send(signal.SIGSTOP, *family)
-        finished = set()
-        for name in ("one", "three"):
-            lab.hit(name, "parent")
-            lab.begin_again(name)
-            assert finished <= set(kept.folders()), "a finished cell was lost"
-            finished = set(kept.folders())
-        if any(lab.crew[name].end() for name in ("one", "three")):
-            # Three of the kills have hit the same cell, which is then given up, and told; the same command takes it up.
-            assert "the process that ran it is gone" in lab.crew["one"].said
-            lab.begin_again("one")
-        assert lab.crew["one"].end() == 0, lab.crew["one"].said
-        assert len(kept.folders()) == 8
-        lab.crew["two"].send(signal.SIGCONT, *family)
-        assert lab.crew["two"].end() == 0, lab.crew["two"].said
-
-        assert undisturbed.end() == 0, undisturbed.said
-        print("kills", dict(lab.kills), "runs of cells", dict(kept.cells()))
-        assert lab.kills.total() >= 4
-        for name in ("one", "two"):
-            check_like(lab.where[name], alone, kept)
-        assert leftovers(lab.where["three"]) == []
-        assert not any(postgres.password in path.read_text() for path in tmp_path.glob("*/log"))
-    finally:
-        server.stop()
-        for run in (undisturbed, *lab.crew.values()):
-            run.send(signal.SIGKILL, *run.family())

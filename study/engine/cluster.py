@@ -153,7 +153,7 @@ class DaskEngine:
             return future.result()
         except KilledWorker:
             reason = f"the process that ran it was killed {TRIES} times; is memory short?"
-            return Failure(reason, transient=False)
+            return Failure(reason, transient=True, exhausted=True)
         except CancelledError:
             raise self._gone() from None
         except Exception as error:  # noqa: BLE001 - what kept the task from running at all, such as a missing package

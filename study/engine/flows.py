@@ -163,7 +163,7 @@ class _Flows:
             running.report_progress(self._listener)
             if len(running.results) == len(running.batch.tasks):
                 self._advance(running, [running.results[index] for index in range(len(running.results))])
-        elif value.transient and tried.attempt < TRIES:
+        elif value.transient and not value.exhausted and tried.attempt < TRIES:
             self._listener.retry(running.name, value.reason)
             self._ready.insert(0, _Try(running, tried.index, tried.attempt + 1))
         else:

@@ -21,10 +21,15 @@ Hear = Callable[..., None]  # hear(number of the task, kind of event, *values)
 
 @dataclass(frozen=True)
 class Failure:
-    """Why a task failed; `transient`: another try may succeed; `expected`: the reason is one clear message."""
+    """Why a task failed.
+
+    `transient`: another try may succeed; `exhausted`: the engine has tried often enough for now; `expected`: the reason
+    is one clear message.
+    """
 
     reason: str
     transient: bool
+    exhausted: bool = False
     expected: bool = True
 
 
