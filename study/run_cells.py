@@ -24,7 +24,7 @@ from study.config import BadInputError, masked
 from study.data import DATA, data_flow, describe_data
 from study.display import Display
 from study.engine.cluster import DaskEngine, cluster_engine, local_engine, visible_gpus
-from study.engine.flows import run_flow, run_flows
+from study.engine.flows import Listener, run_flow, run_flows
 from study.engine.inline import InlineEngine
 from study.engine.tasks import Engine, Failure
 from study.engine.trials import Trials
@@ -81,7 +81,7 @@ def run_cells(plan: Plan, options: argparse.Namespace, tracker: Tracker) -> dict
                 tracker.log_files(sweep_run, files, "data")
             for key in given_up:
                 display.fail(key)
-            run_flows(engine, cells.next_flow, cells)
+            run_flows(engine, cells.next_flow, cells.listener())
             return given_up | cells.close()
 
 
@@ -183,6 +183,19 @@ class Committing:
         key = self._trials.ask()
         return None if key is None else (key, cell_flow(self._jobs[key], one_share=self._one_share))
 
+    def listener(self) -> Listener:
+        """Return what the flows call."""
+        return Listener(
+            self.finished,
+            self.failed,
+            self.progress,
+            self.started,
+            lambda name, device: self._runs[name].note(device=device),
+            lambda name, *epoch: self._runs[name].log(*epoch),
+            self.retry,
+            self._display.tick,
+        )
+
     def started(self, name: str, host: str, process: int) -> None:
         """Open the cell's run when its first task starts; note who runs it."""
         if name not in self._runs:
@@ -194,20 +207,11 @@ class Committing:
             self._display.start(name)
         self._runs[name].note(host=host, process=str(process))
 
-    def device(self, name: str, device: str) -> None:
-        """Note the device."""
-        self._runs[name].note(device=device)
-
-    def log(self, name: str, stage: str, epoch: int, metrics: Mapping[str, float]) -> None:
-        """Log the losses of an epoch."""
-        self._runs[name].log(stage, epoch, metrics)
-
-    def progress(self, name: str, batch: Batch, done: int, total: int) -> None:
+    def progress(self, name: str, stage: str, done: int, total: int) -> None:
         """Show how far the cell is, and tag its run with it."""
-        stage = batch.tasks[0].stage
         if name in self._runs:
-            self._runs[name].progress(stage.name, done, total)
-            self._display.progress(name, stage.name, done, total)
+            self._runs[name].progress(stage, done, total)
+            self._display.progress(name, stage, done, total)
 
     def retry(self, name: str, reason: str) -> None:
         """Say that a task will be tried again."""
@@ -231,10 +235,6 @@ class Committing:
         self._patiently(self._tracker.fail, self._runs.pop(name), failure.reason, permanent=not failure.transient)
         self._trials.fail(name, failure.reason)
         self._display.fail(name)
-
-    def tick(self) -> None:
-        """Draw the display again."""
-        self._display.tick()
 
     def close(self) -> dict[str, str]:
         """End the sweep's run; returns the cells that failed, with the reasons."""

@@ -28,14 +28,14 @@ from study.command import EXIT_AGAIN, EXIT_FAILED, EXIT_INTERRUPTED, Parser, run
 from study.config import BadInputError
 from study.data import DATA, data_flow
 from study.display import Display
-from study.engine.flows import SilentListener, run_flow, run_flows
+from study.engine.flows import Listener, run_flow, run_flows
 from study.engine.inline import InlineEngine
 from study.engine.tasks import Failure
 from study.job import CellJob
 from study.plan import Plan, add_machine_options, add_plan_options, cell_jobs, check_machine, given_plan
 from study.provenance import cores
 from study.result import CellResult
-from study.stages import Batch, Flow, cell_cost
+from study.stages import Flow, cell_cost
 
 if TYPE_CHECKING:  # Dask, which may be missing
     from study.engine.cluster import DaskEngine
@@ -97,7 +97,9 @@ def train(plan: Plan, out: Path, options: argparse.Namespace) -> int:
         run_flow(data_flow(plan.settings, DATA, plan.imported), engine, display.data)
         shutil.copyfile(plan.frames / "manifest.json", out / f"frames-{plan.frames.name}.json")
         saving = _Saving(out, jobs, display, one_share=engine.gpus() > 0)
-        run_flows(engine, saving.next_flow, saving)
+        run_flows(
+            engine, saving.next_flow, Listener(saving.finished, saving.failed, display.progress, tick=display.tick)
+        )
     for key, reason in saving.reasons.items():
         print(f"failed: {labels[key]} ({key}): {reason.strip()}", file=sys.stderr)
     if saving.reasons:
@@ -123,7 +125,7 @@ def _check_installed() -> None:
             )
 
 
-class _Saving(SilentListener):
+class _Saving:
     """Saves results as folders. Each cell is locked while it is trained, so several commands may share `out`."""
 
     def __init__(self, out: Path, jobs: dict[str, CellJob], display: Display, *, one_share: bool) -> None:
@@ -146,10 +148,6 @@ class _Saving(SilentListener):
             self._display.say(f"{self._jobs[key].cell.label}: another process has taken it")
         return None
 
-    def progress(self, name: str, batch: Batch, done: int, total: int) -> None:
-        """Show how far the cell is."""
-        self._display.progress(name, batch.tasks[0].stage.name, done, total)
-
     def finished(self, name: str, value: tuple[CellResult, bytes]) -> None:
         """Save the result."""
         value[0].save(self._out / name)
@@ -163,10 +161,6 @@ class _Saving(SilentListener):
         self.reasons[name] = failure.reason
         self._display.fail(name)
         self._locks.pop(name).release()
-
-    def tick(self) -> None:
-        """Draw the display again."""
-        self._display.tick()
 
 
 if __name__ == "__main__":

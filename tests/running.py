@@ -88,9 +88,7 @@ def sweep(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
 class Running:
     """A command that runs in a session of its own, as one that a terminal has started; stderr goes to a file."""
 
-    def __init__(
-        self, folder: Path, *words: str, log: Path | None = None, role: str = "client", **more: str
-    ) -> None:
+    def __init__(self, folder: Path, *words: str, log: Path | None = None, role: str = "client", **more: str) -> None:
         self.folder, self.log, self.role = folder, log or folder / "log", role
         with self.log.open("ab") as stream:
             self._from = stream.tell()

@@ -9,7 +9,7 @@ import math
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from study.command import check_stopped
 from study.config import BadInputError, TrainingDivergedError
@@ -28,32 +28,22 @@ class FlowFailedError(RuntimeError):
     """A stage failed for a reason that nobody expected; the text is its traceback."""
 
 
-class Listener(Protocol):
-    """Hears what flows do; `name` is the flow's."""
+def ignore(*_: object) -> None:
+    """Do nothing."""
 
-    def started(self, name: str, host: str, process: int) -> None:
-        """A task of the flow has started on a host, in a process."""
 
-    def progress(self, name: str, batch: Batch, done: int, total: int) -> None:
-        """The flow's present stage has come this far."""
+@dataclass(frozen=True)
+class Listener:
+    """What is called when flows come along; `name` is the flow's."""
 
-    def log(self, name: str, stage: str, epoch: int, metrics: Mapping[str, float]) -> None:
-        """An epoch has ended; metrics are means over all tasks of the stage."""
-
-    def device(self, name: str, device: str) -> None:
-        """A task of the flow computes on this device."""
-
-    def retry(self, name: str, reason: str) -> None:
-        """A task of the flow failed and will be tried again."""
-
-    def finished(self, name: str, value: Any) -> None:
-        """The flow has ended with its product."""
-
-    def failed(self, name: str, failure: Failure) -> None:
-        """The flow has failed."""
-
-    def tick(self) -> None:
-        """Some time has passed."""
+    finished: Callable[[str, Any], None]  # name, product
+    failed: Callable[[str, Failure], None]  # name, why
+    progress: Callable[[str, str, int, int], None] = ignore  # name, stage, done, total
+    started: Callable[[str, str, int], None] = ignore  # name, host, process: of a task of the flow
+    device: Callable[[str, str], None] = ignore  # name, what a task of the flow computes on
+    log: Callable[[str, str, int, Mapping[str, float]], None] = ignore  # name, stage, epoch, means over its tasks
+    retry: Callable[[str, str], None] = ignore  # name, why a task is tried again
+    tick: Callable[[], None] = ignore  # some time has passed
 
 
 @dataclass
@@ -75,7 +65,7 @@ class _Running:
         whole = self.batch.before + sum(weights)
         share = (self.batch.before + done) / whole
         total = self.total or whole
-        listener.progress(self.name, self.batch, math.floor(share * total + 1e-9), total)
+        listener.progress(self.name, self.batch.tasks[0].stage.name, math.floor(share * total + 1e-9), total)
 
 
 @dataclass(frozen=True)
@@ -210,52 +200,18 @@ def run_flows(engine: Engine, next_flow: NextFlow, listener: Listener) -> None:
 Progress = Callable[[str, int, int], None]
 
 
-class SilentListener:
-    """A listener to whom nothing matters; what does is overridden."""
-
-    def started(self, *_: object) -> None:
-        """Do nothing, like all of these."""
-
-    def progress(self, *_: Any) -> None:
-        """Do nothing."""
-
-    def log(self, *_: object) -> None:
-        """Do nothing."""
-
-    def device(self, *_: object) -> None:
-        """Do nothing."""
-
-    def retry(self, *_: object) -> None:
-        """Do nothing."""
-
-    def tick(self) -> None:
-        """Do nothing."""
-
-
-class _One(SilentListener):
-    """The listener of a single flow: keeps its product, and tells of progress."""
-
-    def __init__(self, progress: Progress | None) -> None:
-        self._progress = progress
-        self.value: Any = None
-
-    def progress(self, _: str, batch: Batch, done: int, total: int) -> None:
-        if self._progress:
-            self._progress(batch.tasks[0].stage.name, done, total)
-
-    def finished(self, _: str, value: Any) -> None:
-        self.value = value
-
-    def failed(self, _: str, failure: Failure) -> None:
-        raise BadInputError(failure.reason) if failure.expected else FlowFailedError(failure.reason)
-
-
 def run_flow(flow: Flow[T], engine: Engine | None = None, progress: Progress | None = None) -> T:
     """Run one flow, in this process unless an engine is given, and return its product.
 
     `progress(stage, done, total)`. Raises BadInputError for a failure with a clear reason, FlowFailedError for others.
     """
     only = iter([("", flow)])
-    listener = _One(progress)
+    products: list[T] = []
+
+    def fail(_: str, failure: Failure) -> None:
+        raise BadInputError(failure.reason) if failure.expected else FlowFailedError(failure.reason)
+
+    tell = progress or ignore
+    listener = Listener(lambda _, product: products.append(product), fail, lambda _, *how: tell(*how))
     run_flows(engine or InlineEngine(), lambda: next(only, None), listener)
-    return listener.value  # type: ignore[no-any-return]
+    return products[0]
