@@ -127,7 +127,7 @@ class DaskEngine:
         future.add_done_callback(lambda _: self._messages.put(("end", number, None)))
 
     def cancel(self, numbers: Collection[int]) -> None:
-        """Forget tasks: those that wait are dropped, those that run do so in vain."""
+        """Forget tasks: those that wait are dropped, those that run end when they next report."""
         for number in numbers:
             self._futures.pop(number, None)  # Dask releases what nobody holds
 
@@ -173,9 +173,22 @@ class DaskEngine:
         )
 
 
+class _UnwantedError(RuntimeError):
+    """Nobody waits for this task any more: its flow has failed, or its client or scheduler is gone."""
+
+
 def _run_on_worker(topic: str, number: int, task: Task) -> Any:
     worker = get_worker()
-    return perform(task, lambda *values: worker.log_event(topic, (number, values)))
+    key = worker.get_current_task()
+
+    def report(*values: Any) -> None:
+        # Dask cannot stop a thread. Ended here, the task leaves the worker free for those who still want something.
+        state = worker.state.tasks.get(key)
+        if state is None or state.state == "cancelled":
+            raise _UnwantedError
+        worker.log_event(topic, (number, values))
+
+    return perform(task, report)
 
 
 def _sees(file: str) -> bool:
