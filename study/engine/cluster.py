@@ -262,6 +262,8 @@ def cluster_engine(cluster: str, certificates: Path | None = None) -> DaskEngine
     if cluster.endswith((".yaml", ".yml")):
         return _job_engine(Path(cluster))
     check_address(cluster)
+    if cluster.startswith("tls://") and certificates is None:
+        raise BadInputError(f"{masked(cluster)} wants certificates; give the folder that holds them: --certificates DIR")
     security = _security(certificates) if certificates else None
     try:
         client = Client(cluster, security=security, timeout=CONNECT, set_as_default=False)
