@@ -10,6 +10,7 @@ import ipaddress
 import logging
 import os
 import signal
+import sys
 import time
 import uuid
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -34,8 +35,9 @@ from distributed import (
     get_worker,
 )
 
+from study.command import check_stopped
 from study.config import BadInputError, masked, one_of, read_yaml
-from study.engine.flows import TRIES
+from study.engine.flows import TRIES, WAIT
 from study.engine.tasks import Failure, Hear, perform
 from study.stages import Task
 
@@ -96,9 +98,9 @@ class DaskEngine:
             self._looked = time.monotonic()
 
     def slots(self) -> int:
-        """Return how many tasks can run at a time, just now."""
+        """Return how many tasks can run at a time, just now; 1 while the cluster has no worker, which waits for it."""
         self._look()
-        return self._slots
+        return max(1, self._slots)
 
     def gpus(self) -> int:
         """Return how many GPUs the workers have, just now."""
@@ -106,7 +108,15 @@ class DaskEngine:
         return self._gpus
 
     def workers_see(self, file: Path) -> bool:
-        """Return whether every worker sees this file under this path, as in a shared folder."""
+        """Wait for a worker, and return whether all there are see this file under this path, as in a shared folder."""
+        said = False
+        while not self._slots:
+            self._look()
+            if not self._slots and not said:
+                print(f"waiting for a worker to come to the scheduler at {self._address}", file=sys.stderr, flush=True)
+                said = True
+            time.sleep(0 if self._slots else WAIT)
+            check_stopped()
         with self._lost():
             return bool(seen := self._client.run(partial(_sees, str(file)))) and all(seen.values())
 
@@ -263,7 +273,9 @@ def cluster_engine(cluster: str, certificates: Path | None = None) -> DaskEngine
         return _job_engine(Path(cluster))
     check_address(cluster)
     if cluster.startswith("tls://") and certificates is None:
-        raise BadInputError(f"{masked(cluster)} wants certificates; give the folder that holds them: --certificates DIR")
+        raise BadInputError(
+            f"{masked(cluster)} wants certificates; give the folder that holds them: --certificates DIR"
+        )
     security = _security(certificates) if certificates else None
     try:
         client = Client(cluster, security=security, timeout=CONNECT, set_as_default=False)
