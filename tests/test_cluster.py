@@ -1,6 +1,6 @@
 """A sweep on many machines: a scheduler and workers in folders of their own, over TLS, and what they survive."""
 
-import datetime
+import datetime as dt
 import ipaddress
 import signal
 import sys
@@ -12,7 +12,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
-from running import FOUR, Running, check_like, command, store, sweep, working_folder
+from running import PLAN, Running, check_like, command, store, sweep, working_folder
 from servers import LOOPBACK, free_port
 
 pytestmark = pytest.mark.stress
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.stress
 def make_certificates(folder):
     """Write ca.pem, cert.pem and key.pem: one authority, and one certificate for every role."""
     folder.mkdir()
-    now = datetime.datetime.now(datetime.UTC)
+    now = dt.datetime.now(dt.UTC)
 
     def certify(name, issuer, issuer_key, key, *, authority):
         builder = (
@@ -30,8 +30,8 @@ def make_certificates(folder):
             .issuer_name(x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, issuer)]))
             .public_key(key.public_key())
             .serial_number(x509.random_serial_number())
-            .not_valid_before(now - datetime.timedelta(days=1))
-            .not_valid_after(now + datetime.timedelta(days=1))
+            .not_valid_before(now - dt.timedelta(days=1))
+            .not_valid_after(now + dt.timedelta(days=1))
             .add_extension(x509.BasicConstraints(ca=authority, path_length=None), critical=True)
             .add_extension(
                 x509.SubjectAlternativeName([x509.IPAddress(ipaddress.ip_address(LOOPBACK))]), critical=False
@@ -88,11 +88,10 @@ def cluster(tmp_path):
 def test_three_machines_and_many_kills_end_with_the_table_of_one(quiet, cluster, tmp_path):
     """Kills a worker, a nanny, the scheduler and the client; every worker makes the frames in a folder of its own."""
     folder = working_folder(tmp_path / "client")
-    words = [word for word in FOUR if word not in ("--workers", "2")]
     kills = Counter()
 
     def begin():
-        return Running(folder, *command("heads", *words[1:], *cluster.words))
+        return Running(folder, *command(*PLAN, "--ceiling", "false", *cluster.words))
 
     def kill(run, *roles):
         pids = [pid for role in roles for pid in run.of(role)]

@@ -57,7 +57,7 @@ STORM = 40  # kills at least
 LATER = {"record": "data/frames/*/manifest.json", "render": "data/frames/*/manifest.json"}  # the stage is over
 
 
-def test_a_storm_of_kills_changes_nothing(quiet, tmp_path):
+def test_a_storm_of_kills_changes_nothing(quiet, tmp_path):  # noqa: C901 - one story
     """SIGKILL at random moments of every stage, to the client and to workers."""
     rng = random.Random("storm")
     folder = working_folder(tmp_path)
