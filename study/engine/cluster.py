@@ -90,7 +90,10 @@ class DaskEngine:
     def _look(self) -> None:
         if time.monotonic() - self._looked > SIZE or not self._slots:
             with self._lost():
-                workers = self._client.scheduler_info(n_workers=-1)["workers"].values()
+                workers = self._client.scheduler_info(n_workers=-1).get("workers")
+            if workers is None:
+                raise self._gone()
+            workers = workers.values()
             self._gpus = int(sum(worker["resources"].get(GPU, 0) for worker in workers))
             # A worker with a GPU trains there, and leaves the rest to the others where there are any.
             plain = sum(worker["nthreads"] for worker in workers if not worker["resources"].get(GPU))
@@ -154,7 +157,7 @@ class DaskEngine:
                 hear(number, *values)
             elif (future := self._futures.pop(number, None)) is not None:
                 ended.append((number, self._value(future)))
-        if self._client.status not in ("running", "connecting"):
+        if self._client.status != "running":  # what ran is lost to it, even if it connects again
             raise self._gone()
         return ended
 
@@ -255,7 +258,7 @@ def _close(client: Client, cluster: Any = None) -> None:
 def _configure() -> None:
     """Set Dask's configuration for this process and the workers that it starts."""
     dask.config.set(CONFIGURATION)
-    for name in ("distributed", "tornado", "asyncio", "bokeh"):
+    for name in ("distributed", "distributed.client", "distributed.core", "tornado", "asyncio"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
 
 
