@@ -344,7 +344,8 @@ def start_jobs(kind: Callable[..., Any], arguments: Mapping[str, Any], workers: 
     defaults = {
         "cores": 1,
         "processes": 1,
-        "memory": "8GB",
+        "memory": "8GB",  # the batch system's limit; Dask's own would count frames that are only mapped
+        "worker_extra_args": ["--memory-limit", "0"],
         "security": Security.temporary(),
         "protocol": "tls://",
         "shared_temp_directory": str(folder.absolute()),
