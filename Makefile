@@ -4,7 +4,7 @@ VENV := .venv
 RUN := $(VENV)/bin/python
 ARGS ?=
 
-.PHONY: help heads datasize test format lock
+.PHONY: help heads datasize test stress format lock
 .DEFAULT_GOAL := help
 
 help: ## this list
@@ -22,11 +22,14 @@ heads: $(VENV)/.installed ## the main job: effect of different heads, ends in re
 datasize: $(VENV)/.installed ## effect of dataset size, ends in reports/datasize.pdf
 	$(RUN) -m study.sweep datasize $(ARGS)
 
-test: $(VENV)/.installed ## lint, types and the whole test suite
+test: $(VENV)/.installed ## lint, types and the tests
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
-	$(RUN) -m pytest $(ARGS)
+	$(RUN) -m pytest -m "not stress" $(ARGS)
+
+stress: $(VENV)/.installed ## the long fault tests: kills, clusters
+	$(RUN) -m pytest -m stress $(ARGS)
 
 format: $(VENV)/.installed ## put the code into its one form
 	$(VENV)/bin/ruff format .

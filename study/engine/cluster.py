@@ -318,7 +318,23 @@ def _security(folder: Path) -> Security:
         raise BadInputError(
             f"{folder} has no {', '.join(missing)}; --certificates needs {', '.join(CERTIFICATES.values())}"
         )
-    return Security(require_encryption=True, **{name: str(file) for name, file in files.items()})
+    everyone = {
+        name.replace("client", role): str(file)
+        for name, file in files.items()
+        for role in ("client", "scheduler", "worker")
+    }
+    return Security(require_encryption=True, **everyone)
+
+
+def _make_certificates(folder: Path) -> Path:
+    """Write new certificates for one run. Jobs read them, so they lie in the working folder, which is shared."""
+    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+    temporary = Security.temporary()
+    for name, file in CERTIFICATES.items():
+        path = folder / file
+        path.touch(mode=0o600)
+        path.write_text(getattr(temporary, name), encoding="ascii")
+    return folder
 
 
 def _job_engine(path: Path) -> DaskEngine:
@@ -339,16 +355,13 @@ def _job_engine(path: Path) -> DaskEngine:
 
 def start_jobs(kind: Callable[..., Any], arguments: Mapping[str, Any], workers: int, source: str) -> DaskEngine:
     """Start a scheduler here and ask a batch system for workers, over TLS with certificates made for this run."""
-    folder = Path("data") / "tmp" / "certificates"
-    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     defaults = {
         "cores": 1,
         "processes": 1,
         "memory": "8GB",  # the batch system's limit; Dask's own would count frames that are only mapped
         "worker_extra_args": ["--memory-limit", "0"],
-        "security": Security.temporary(),
+        "security": _security(_make_certificates(Path("data").absolute() / "tmp" / "certificates")),
         "protocol": "tls://",
-        "shared_temp_directory": str(folder.absolute()),
         "silence_logs": logging.CRITICAL,
     }
     if arguments.keys() & {"security", "protocol"}:
