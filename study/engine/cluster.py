@@ -366,8 +366,10 @@ def start_jobs(kind: Callable[..., Any], arguments: Mapping[str, Any], workers: 
     }
     if arguments.keys() & {"security", "protocol"}:
         raise BadInputError(f"{source}: leave out 'security' and 'protocol'; workers always connect over TLS")
+    quiet = {"dashboard": False, "dashboard_address": "127.0.0.1:0"}  # which would be for everyone to read
+    options = {**defaults, **arguments, "scheduler_options": quiet | arguments.get("scheduler_options", {})}
     try:
-        cluster = kind(**{**defaults, **arguments})
+        cluster = kind(**options)
         cluster.scale(workers)
         client = Client(cluster, timeout=CONNECT)
     except (OSError, TypeError, ValueError, RuntimeError, ImportError) as error:
