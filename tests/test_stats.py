@@ -8,7 +8,6 @@ import scipy.special
 import statsmodels.api as sm
 from scipy import stats as scipy_stats
 from sklearn import linear_model, preprocessing
-from statsmodels.stats.multitest import multipletests
 from statsmodels.stats.weightstats import DescrStatsW
 
 from simulated import DATASIZE_GRID, HEADS_GRID, Null, World, simulate
@@ -440,7 +439,7 @@ def test_holm_keeps_the_family_wise_error_of_all_pairs_of_four():
     for _ in range(1000):
         groups = rng.normal(0, 1, (4, 10))
         p_values = [stats.sign_flip(a - b) for a, b in itertools.combinations(groups, 2)]
-        wrong += min(multipletests(p_values, method="holm")[1]) <= 0.05
+        wrong += len(p_values) * min(p_values) <= 0.05  # Holm's smallest p
     assert 0.01 < wrong / 1000 < 0.05 + 3 * math.sqrt(0.05 * 0.95 / 1000)
 
 
