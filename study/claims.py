@@ -86,6 +86,11 @@ def label(point: Point, grid: Grid) -> str:
     return heads if len(grid.fractions) == 1 else f"{heads} at {fraction * 100:g} %"
 
 
+def difference_label(first: Point, second: Point, grid: Grid) -> str:
+    """Return the name for people of a difference, first minus second."""
+    return f"{label(first, grid)} {MINUS} {label(second, grid)}"
+
+
 # --- comparisons ----------------------------------------------------------------------------------------------------
 
 
@@ -304,7 +309,7 @@ def _difference(
     """Return a paired difference in final scores: name, interval, sampling units, and the ends for a whole family."""
     values = stats.paired(stats.final(curves[first]), stats.final(curves[second]))
     units = stats.by_encoder(values)
-    what = f"{label(first, evidence.grid)} {MINUS} {label(second, evidence.grid)}"
+    what = difference_label(first, second, evidence.grid)
     return what, stats.mean_interval(values), units, stats.t_limits(units, 1 - evidence.rules.alpha / family)
 
 

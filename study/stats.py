@@ -135,7 +135,7 @@ def curve_bands(table: pd.DataFrame, metric: str, split: str = "test", stage: st
 def t_limits(values: Array, level: float = LEVEL) -> tuple[Any, Any]:
     """Return the ends of Student's interval of the mean along the first axis; NaN for fewer than two values."""
     if len(values) < 2:
-        nothing = np.full(values.shape[1:], np.nan)
+        nothing = np.full(values.shape[1:], np.nan)[()]
         return nothing, nothing
     low, high = DescrStatsW(values).tconfint_mean(1 - level)
     return low, high
