@@ -7,9 +7,6 @@ long at the paper's scale is taken from a random part of the frames, and says ho
 from __future__ import annotations
 
 import json
-import os
-import shutil
-import tempfile
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -18,7 +15,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from sklearn.metrics import pairwise_distances_chunked
 
+from study.atomic import atomic_folder
 from study.config import ACCELERATIONS, IMAGE
 from study.episode import episode_digest
 from study.frames import Frames, FrameStore
@@ -27,10 +26,11 @@ from study.selection import SETS
 FILES = ("card.json", "card.txt", "card.png")
 VIEW_DRIVES, VIEW_FRAMES = 8, 1000  # of each set, in which the agents in view are counted
 POOL, QUERIES = 12_000, 1000  # frames of each set that are split for the count of twins; test frames that are looked up
-SIDE = 16  # pixels of a thumbnail: 256 products of two bytes add up to less than 2^24, so float32 is exact
+SIDE = 16  # pixels of a thumbnail
 TWIN = 2.0  # [grey levels of 255], nearer frames are twins: the difference does not show
 DISTANCES = tuple(range(31))  # [grey levels], where the distribution of the distances is given
 QUANTILES = (0.05, 0.25, 0.5, 0.75)
+MEMORY = 32  # [MiB] of distances at once
 CHUNK = 500  # images read at once: 6 MB
 
 _VIEW, _POOL, _FRAME, _DRIVE = 0, 1, 2, 3  # what a random generator is for
@@ -70,17 +70,11 @@ def write_card(store: FrameStore, drives: Sequence[Path], folder: Path) -> tuple
     from study.figures import data_card, write  # noqa: PLC0415 - matplotlib; a card that is there needs none
 
     card = make_card(store, drives)
-    place = folder / "card"
-    with tempfile.TemporaryDirectory(prefix=".card.", dir=folder) as name:
-        draft = Path(name) / "card"
-        draft.mkdir()
+    with atomic_folder(folder / "card") as draft:
         (draft / "card.json").write_text(json.dumps(card, indent=1, allow_nan=False) + "\n", encoding="utf-8")
         (draft / "card.txt").write_text(card_text(card), encoding="utf-8")
         write(data_card(card), draft / "card.png")
-        if place.exists():
-            shutil.rmtree(place)
-        os.rename(draft, place)  # noqa: PTH104 - the one atomic step
-    return tuple(place / name for name in FILES)
+    return tuple(folder / "card" / name for name in FILES)
 
 
 def card_files(store: FrameStore, drives: Sequence[Path], folder: Path) -> tuple[Path, ...]:
@@ -217,21 +211,17 @@ def thumbnails(images: Grey, rows: NDArray[np.int64]) -> Grey:
 
 
 def nearest_frames(asked: Grey, among: Grey) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Distance of each thumbnail [M, 256] to the nearest `among` [N, 256], and its row: root mean square, grey levels.
+    """Return the distance of each thumbnail [M, 256] to the nearest `among` [N, 256], and its row.
 
-    Exact, hence the same on every machine: all products and sums are whole numbers that float32 holds.
+    The distance is the root mean square, in grey levels. It is exact, hence the same on every machine: all products
+    and sums are whole numbers that float64 holds.
     """
-    others = among.astype(np.float32)
-    norms = np.square(others).sum(axis=1, dtype=np.float64)
-    distance, nearest = np.empty(len(asked)), np.empty(len(asked), np.int64)
-    for start in range(0, len(asked), 250):
-        mine = asked[start : start + 250].astype(np.float32)
-        square = norms - 2.0 * (mine @ others.T).astype(np.float64)
-        best = square.argmin(axis=1)
-        nearest[start : start + 250] = best
-        left = square[np.arange(len(mine)), best] + np.square(mine).sum(axis=1, dtype=np.float64)
-        distance[start : start + 250] = np.sqrt(left / asked.shape[1])
-    return distance, nearest
+    nearest = (
+        (distances.argmin(axis=1), distances.min(axis=1))
+        for distances in pairwise_distances_chunked(asked, among, working_memory=MEMORY)
+    )
+    rows, distance = (np.concatenate(part) for part in zip(*nearest, strict=True))
+    return distance / np.sqrt(asked.shape[1]), rows
 
 
 # --- text -----------------------------------------------------------------------------------------------------------

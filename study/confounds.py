@@ -64,6 +64,7 @@ CONFOUNDS = (
     ),
 )
 
+KIND = "Welch's t, over policy or encoder seeds"
 Movement = Literal["moved", "open"]
 
 
@@ -117,7 +118,7 @@ def contrasts(record: SweepRecord, other: SweepRecord, confound: Confound) -> li
         here, there = (stats.paired(stats.final(panel[first]), stats.final(panel[second])) for panel in panels)
         if not len(here) or not len(there):
             continue
-        change = stats.unpaired(stats.by_encoder(there), stats.by_encoder(here))
+        change = stats.welch(stats.by_encoder(there), stats.by_encoder(here), KIND)
         one_encoder = stats.design([panel[point] for panel in panels for point in (first, second)]) == "A"
         more = record.grid.rules.encoder_allowance if one_encoder else 0.0
         moved = change.low - more > 0 or change.high + more < 0

@@ -37,9 +37,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
-import shutil
-import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -49,6 +46,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from study.atomic import atomic_folder
 from study.config import ACCELERATIONS, BadInputError
 
 SCHEMA_VERSION = 1
@@ -156,10 +154,7 @@ def write_episode(episode: Episode, folder: Path) -> str:
     An existing `folder` is replaced. Raises BadInputError when the Episode breaks its own schema.
     """
     check_episode(episode, str(folder))
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as name:
-        draft = Path(name) / folder.name
-        draft.mkdir()
+    with atomic_folder(folder) as draft:
         (draft / "map.json").write_text(json.dumps(_map_json(episode), separators=(",", ":"), allow_nan=False))
         for file, table in _tables(episode).items():
             pq.write_table(table, draft / file, compression="zstd", compression_level=3)
@@ -178,9 +173,6 @@ def write_episode(episode: Episode, folder: Path) -> str:
             "digests": digests,
         }
         (draft / "episode.json").write_text(json.dumps(head, indent=1, allow_nan=False))
-        if folder.exists():
-            shutil.rmtree(folder)
-        os.rename(draft, folder)  # noqa: PTH104 - the one atomic step
     return _digest(digests)
 
 

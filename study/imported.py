@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import os
-import tempfile
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from study.atomic import atomic_folder
 from study.config import BadInputError, FramesSettings, content_key
 
 SCHEMA_VERSION = 1
@@ -118,9 +118,7 @@ def import_drives(source: Path, out: Path) -> Imported:
     if out.resolve().is_relative_to(source.resolve()):
         raise BadInputError(f"--out {out} lies within {source}; it would be imported the next time")
     try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as name:
-            draft = Path(name) / "new"
+        with atomic_folder(out) as draft:
             drives = []
             for drive, folder in found.items():
                 adapted = adapt(read_episode(folder), str(folder))
@@ -130,9 +128,6 @@ def import_drives(source: Path, out: Path) -> Imported:
                 drives.append(Drive(drive, digest, there, adapted.egos, seconds, adapted.derived, adapted.skipped))
             content = {"schema_version": SCHEMA_VERSION, "drives": [asdict(drive) for drive in drives]}
             (draft / "import.json").write_text(json.dumps(content, indent=1, allow_nan=False))
-            if out.exists():
-                out.rename(Path(name) / "old")
-            draft.rename(out)
     except OSError as error:
         raise BadInputError(f"cannot write {out}: {error.strerror}; name another folder with --out") from error
     return Imported(out, tuple(drives))

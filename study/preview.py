@@ -6,9 +6,6 @@ vehicle of one drive, in real time, in bird view as the encoder sees it and on t
 
 from __future__ import annotations
 
-import os
-import shutil
-import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -16,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from study.atomic import atomic_folder
 from study.birdview import Renderer, governing_light
 from study.config import ACCELERATIONS, IMAGE, BadInputError, BirdviewSettings
 from study.episode import GREEN, Episode, read_episode
@@ -46,18 +44,12 @@ def write_preview(store: FrameStore, drives: Sequence[Path], folder: Path) -> tu
             f"none of the drives that {folder} was made from is there any more: "
             "delete that folder and build it again, then the drives are recorded too"
         )
-    place = folder / "preview"
     birdview = BirdviewSettings.model_validate(store.manifest["settings"]["birdview"])
-    with tempfile.TemporaryDirectory(prefix=".preview.", dir=folder) as name:
-        draft = Path(name) / "preview"
-        draft.mkdir()
+    with atomic_folder(folder / "preview") as draft:
         sets = {name: sample(getattr(store, name), number) for number, name in enumerate(SETS)}
         write(contact_sheet(sets), draft / FILES[0])
         write_film(read_episode(drives[0]), birdview, draft / FILES[1])
-        if place.exists():
-            shutil.rmtree(place)
-        os.rename(draft, place)  # noqa: PTH104 - the one atomic step
-    return tuple(place / name for name in FILES)
+    return tuple(folder / "preview" / name for name in FILES)
 
 
 # --- contact sheet --------------------------------------------------------------------------------------------------

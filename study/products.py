@@ -7,9 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import shutil
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,6 +17,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save
 
+from study.atomic import atomic_folder
 from study.config import BadInputError
 
 Arrays = dict[str, NDArray[Any]]
@@ -35,10 +33,7 @@ def write_product(
     add: Callable[[Path], object] | None = None,
 ) -> Path:
     """Write `folder` with `head_file`, one safetensors file for each part, the table, and what `add` writes into it."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as name:
-        draft = Path(name) / folder.name
-        draft.mkdir()
+    with atomic_folder(folder) as draft:
         for part, arrays in parts.items():
             # Not `save_file`, whose error for a full disk is no OSError.
             content = save({key: np.ascontiguousarray(value) for key, value in arrays.items()})
@@ -48,9 +43,6 @@ def write_product(
         (draft / head_file).write_text(json.dumps({**head, "digests": digests}, indent=1), encoding="utf-8")
         if add:
             add(draft)
-        if folder.exists():
-            shutil.rmtree(folder)
-        os.rename(draft, folder)  # noqa: PTH104 - the one atomic step
     return folder
 
 

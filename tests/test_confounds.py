@@ -82,7 +82,7 @@ def test_what_matters_below_all_the_data_is_shown_there_only():
 
 def test_welchs_interval_covers_a_true_difference():
     rng = np.random.default_rng(0)
-    found = [stats.unpaired(rng.normal(0.3, 1, 15), rng.normal(0, 2, 8)) for _ in range(800)]
+    found = [stats.welch(rng.normal(0.3, 1, 15), rng.normal(0, 2, 8)) for _ in range(800)]
     assert 0.93 < np.mean([each.low < 0.3 < each.high for each in found]) < 0.97
 
 
