@@ -69,9 +69,10 @@ def test_a_failed_cell_leaves_the_others_is_told_and_runs_again_when_asked_for(q
         assert store(tmp_path).cells() == {"FAILED": tries}
 
 
-def test_four_workers_give_the_table_of_two(quiet, tmp_path):
+@pytest.mark.parametrize("workers", ["1", "4"])
+def test_one_and_four_workers_give_the_table_of_two(quiet, tmp_path, workers):
     quiet.copy(tmp_path)
-    done = sweep(tmp_path, *FOUR, "--workers", "4", "--no-report")
+    done = sweep(tmp_path, *FOUR, "--workers", workers, "--no-report")
     assert done.returncode == 0, done.stderr
     assert table(tmp_path).to_csv() == table(quiet.folder).to_csv()
 
