@@ -8,7 +8,8 @@ import pytest
 
 from drives import write_drives
 from study.config import BirdviewSettings, FramesSettings
-from study.frames import build_frames
+from study.engine.flows import run_flow
+from study.frames import frames_flow
 from study.store import SQLITE, open_store
 
 
@@ -24,7 +25,7 @@ def small_store(small_drives: list[Path], tmp_path_factory: pytest.TempPathFacto
     """The folder of a frame store of those drives; cards and previews may be written there."""
     made = tmp_path_factory.mktemp("frames") / "store"
     settings = FramesSettings(encoder=60, policy=40)
-    build_frames(settings, BirdviewSettings(), small_drives[:3], small_drives[3:], made, 1)
+    run_flow(frames_flow(settings, BirdviewSettings(), small_drives[:3], small_drives[3:], made))
     return made
 
 
