@@ -15,8 +15,8 @@ if TYPE_CHECKING:  # plain lines need no rich, and a machine that only trains ma
 
 LINE_EVERY = 15.0  # [s] between two plain lines
 DATA_KEY = ""
-RECORD_SHARE = 0.8  # of the data's time, where the stages are not told apart beforehand
-DATA_SHARES = {"record": RECORD_SHARE, "render": 1 - RECORD_SHARE}
+# Of the data's time, where the stages are not told apart beforehand: what is over when a stage begins, and its own.
+DATA_SHARES = {"record": (0.0, 0.8), "select": (0.8, 0.0), "render": (0.8, 0.2), "describe": (1.0, 0.0)}
 
 
 def show_table(rows: Sequence[Sequence[str]], styles: Sequence[str]) -> None:
@@ -75,7 +75,8 @@ class Display:
 
     def data(self, stage: str, done: int, whole: int) -> None:
         """The data stage has come this far; what was there when it began does not count as speed."""
-        share = RECORD_SHARE * (stage != "record") + done / max(whole, 1) * DATA_SHARES.get(stage, 0.0)
+        before, part = DATA_SHARES[stage]
+        share = before + part * done / max(whole, 1)
         now = time.monotonic()
         if stage not in self._data_since:
             self._data_since[stage] = (now, done)
@@ -85,7 +86,7 @@ class Display:
         rate = (done - there) / (now - began) if now > began else 0.0
         said = f", {rate:,.0f}/s" if rate >= 100 else f", {rate:.2g}/s" if rate else ""
         self._state[DATA_KEY] = f"{STAGES[stage].activity} {done:,}/{whole:,}{said}"
-        if stage == "describe" and done == whole:
+        if stage in ("render", "describe") and done == whole:
             self._state.pop(DATA_KEY)
         self.tick()
 
@@ -102,12 +103,6 @@ class Display:
         self._resumed.setdefault(key, self._shares[key] if done > 1 else 0.0)
         self._state[key] = f"{kind.activity}, {kind.unit} {done:,}/{whole:,}" if whole > 1 else kind.activity
         self.tick()
-
-    def wait(self, key: str, why: str) -> None:
-        """A cell that ran does so no more, and waits again."""
-        self._shares[key] = 0.0
-        self._state.pop(key, None)
-        self.say(f"{self._labels[key]}: {why}")
 
     def finish(self, key: str) -> None:
         """A cell is committed."""

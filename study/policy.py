@@ -536,7 +536,7 @@ def join_policies(shares: Sequence[TrainedPolicies]) -> TrainedPolicies:
     first = shares[0]
     curves = pd.concat([share.curves for share in shares], ignore_index=True)
     ranks = {name: curves[name].map({each: rank for rank, each in enumerate(order)}) for name, order in _ORDER.items()}
-    order = np.lexsort((curves["policy_seed"], ranks["metric"], ranks["split"], curves["epoch"]))
+    order = np.lexsort((ranks["metric"], ranks["split"], curves["epoch"]))  # stable: seeds stay in order
     return TrainedPolicies(
         weights={
             name: value if name.startswith("z_") else np.concatenate([share.weights[name] for share in shares])

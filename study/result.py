@@ -64,7 +64,10 @@ class CellResult:
     @staticmethod
     def load(folder: Path) -> CellResult:
         """Read what `save` wrote. Raises BadInputError when it is not whole."""
-        head, parts, curves = read_product(folder, HEAD, ARRAYS)
+        try:
+            head, parts, curves = read_product(folder, HEAD, ARRAYS)
+        except BadInputError as error:
+            raise BadInputError(f"{error}; run the cell again") from error
         if head.get("format_version") != FORMAT_VERSION:
             found = head.get("format_version")
             raise BadInputError(f"{folder}: format {found}; this program reads {FORMAT_VERSION}; run the cell again")

@@ -12,7 +12,8 @@ from drives import crossing_drive, write_drives
 from study.adapt import STEERING_UNIT, adapt, derived_commands
 from study.birdview import valid_moments
 from study.config import BadInputError, FramesSettings, load_profile
-from study.data import prepare
+from study.data import data_flow
+from study.engine.flows import run_flow
 from study.episode import file_digest, read_episode, write_episode
 from study.frames import open_frames
 from study.imported import import_drives, open_import
@@ -255,7 +256,7 @@ def test_a_sweeps_cells_are_known_by_the_drives_they_stand_on(folder, tmp_path):
 def test_imported_drives_become_the_frames_of_a_sweep(folder, tmp_path):
     imported = import_drives(folder, tmp_path / "out")
     settings = load_profile("smoke", {"frames": {"encoder": 10, "policy": 10}})
-    store = open_frames(prepare(settings, tmp_path, 1, lambda *_: None, imported))
+    store = open_frames(run_flow(data_flow(settings, tmp_path, imported)))
     assert (len(store.encoder), len(store.policy)) == (10, 10)
     assert not (tmp_path / "episodes").exists()
 
@@ -263,7 +264,7 @@ def test_imported_drives_become_the_frames_of_a_sweep(folder, tmp_path):
 def test_drives_that_give_too_few_frames_are_told_with_the_setting(folder, tmp_path):
     imported = import_drives(folder, tmp_path / "out")
     with pytest.raises(BadInputError, match=r"needs \d+ .*frames.*lower --frames\.encoder"):
-        prepare(load_profile("smoke"), tmp_path, 1, lambda *_: None, imported)
+        run_flow(data_flow(load_profile("smoke"), tmp_path, imported))
 
 
 def test_a_drive_that_has_changed_since_is_told(folder, tmp_path):

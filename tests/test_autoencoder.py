@@ -42,10 +42,11 @@ from study.config import (
     BirdviewSettings,
     EncoderSettings,
     FramesSettings,
+    TrainingDivergedError,
     parameter_counts,
 )
-from study.frames import Frames, build_frames, open_frames, unpack_masks
-from study.result import TrainingDivergedError
+from study.engine.flows import run_flow
+from study.frames import Frames, frames_flow, open_frames, unpack_masks
 from waiting import questions
 
 FRAMES = FramesSettings(encoder=160, policy=40, spacing=0.3, balance="none")
@@ -59,7 +60,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
         write_drives(folder, 5, cars=8, steps=60),
         write_drives(folder, 2, first_seed=50, cars=8, steps=60),
     )
-    build_frames(FRAMES, BirdviewSettings(), encoder, policy, folder / "store", 1)
+    run_flow(frames_flow(FRAMES, BirdviewSettings(), encoder, policy, folder / "store"))
     return folder / "store"
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from study.command import EXIT_INTERRUPTED, check_stopped, stoppable, unbroken
 
-HEAVY = ("torch", "lightning", "mlflow", "optuna", "matplotlib", "highway_env", "cv2", "pandas")
+HEAVY = ("torch", "lightning", "mlflow", "optuna", "matplotlib", "highway_env", "cv2", "pandas", "distributed")
 
 
 def sweep(*words, cwd=None):
@@ -106,17 +106,3 @@ def test_a_stop_that_python_dropped_comes_again():
 
     assert stoppable(work, "") == EXIT_INTERRUPTED
     check_stopped()  # is over then
-
-
-def test_children_are_born_deaf_to_ctrl_c_the_first_one_too():
-    code = (
-        "import signal\n"
-        "from multiprocessing import resource_tracker\n"
-        "from study.command import deaf_to_interrupts\n"
-        "with deaf_to_interrupts():\n"
-        "    resource_tracker.ensure_running()  # as the start of a child does\n"
-        "    print(signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, []))\n"
-        "print(signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, []))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["True", "False"]

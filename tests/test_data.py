@@ -8,7 +8,9 @@ from types import SimpleNamespace
 import pytest
 
 from study.config import BadInputError, load_profile
-from study.data import frames_folder, main, prepare
+from study.data import data_flow, frames_folder, main
+from study.engine.cluster import local_engine
+from study.engine.flows import run_flow
 from study.frames import open_frames
 from study.stages import data_cost
 
@@ -28,7 +30,7 @@ def settings():
 @pytest.fixture(scope="module")
 def root(settings, tmp_path_factory):
     made = tmp_path_factory.mktemp("data")
-    prepare(settings, made, 1, lambda *_: None)
+    run_flow(data_flow(settings, made))
     return made
 
 
@@ -39,22 +41,36 @@ def test_the_two_sets_come_from_different_drives(settings, root):
     assert [len(found) for found in sources] == [2, 2]
 
 
+def contents(folder):
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("workers", [2, 4])
+def test_drives_and_frames_are_the_same_bytes_whoever_makes_them(settings, root, tmp_path, workers):
+    """Recording, choosing and rendering by Dask's workers, against this process alone."""
+    with local_engine(workers, tmp_path / "scratch") as engine:
+        folder = run_flow(data_flow(settings, tmp_path / "data"), engine)
+    here = frames_folder(settings, root)
+    assert open_frames(folder, check=True).manifest["digest"] == open_frames(here).manifest["digest"]
+    assert contents(tmp_path / "data") == contents(root)
+
+
 def test_what_is_there_is_not_made_again(settings, root):
     told = []
-    prepare(settings, root, 1, lambda *what: told.append(what))
+    run_flow(data_flow(settings, root), progress=lambda *what: told.append(what))
     assert told == []
 
 
 def test_progress_reaches_the_end(settings, tmp_path):
     told = []
-    prepare(settings, tmp_path, 1, lambda *what: told.append(what))
-    assert [stage for stage, done, whole in told if done == whole] == ["record", "render"]
+    run_flow(data_flow(settings, tmp_path), progress=lambda *what: told.append(what))
+    assert [stage for stage, done, whole in told if done == whole] == ["record", "select", "render"]
 
 
 def test_drives_that_are_there_need_no_simulator(settings, root, tmp_path, monkeypatch):
     shutil.copytree(root / "episodes", tmp_path / "episodes")
     monkeypatch.setitem(sys.modules, "study.sim.record", None)
-    again = open_frames(prepare(settings, tmp_path, 1, lambda *_: None))
+    again = open_frames(run_flow(data_flow(settings, tmp_path)))
     assert again.manifest == open_frames(frames_folder(settings, root)).manifest
 
 
@@ -63,7 +79,7 @@ def test_a_damaged_store_is_told_and_made_again(settings, root, tmp_path, capsys
     images = frames_folder(settings, tmp_path / "data") / "encoder" / "images.npy"
     content = images.read_bytes()
     images.write_bytes(content[:-1] + bytes([content[-1] ^ 255]))
-    prepare(settings, tmp_path / "data", 1, lambda *_: None)
+    run_flow(data_flow(settings, tmp_path / "data"))
     assert "images.npy" in capsys.readouterr().err
     assert images.read_bytes() == content
 
@@ -71,7 +87,7 @@ def test_a_damaged_store_is_told_and_made_again(settings, root, tmp_path, capsys
 def test_a_full_disk_is_told_before_anything_is_made(settings, tmp_path, monkeypatch):
     monkeypatch.setattr("study.data.shutil.disk_usage", lambda _: SimpleNamespace(free=1000))
     with pytest.raises(BadInputError, match="free"):
-        prepare(settings, tmp_path, 1, lambda *_: None)
+        run_flow(data_flow(settings, tmp_path))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -79,13 +95,13 @@ def test_room_that_a_killed_build_has_taken_is_not_asked_for_again(settings, roo
     shutil.copytree(root / "episodes", tmp_path / "episodes")
     free = data_cost(settings).bytes - 10_000
     monkeypatch.setattr("study.data.shutil.disk_usage", lambda _: SimpleNamespace(free=free))
-    assert (prepare(settings, tmp_path, 1, lambda *_: None) / "manifest.json").is_file()
+    assert (run_flow(data_flow(settings, tmp_path)) / "manifest.json").is_file()
 
 
 def test_a_folder_that_cannot_be_made_is_told(settings, tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(BadInputError, match="cannot write"):
-        prepare(settings, tmp_path / "file" / "data", 1, lambda *_: None)
+        run_flow(data_flow(settings, tmp_path / "file" / "data"))
 
 
 def test_imported_drives_have_a_card_and_a_preview_too(root, tmp_path, monkeypatch, capsys):
@@ -93,7 +109,7 @@ def test_imported_drives_have_a_card_and_a_preview_too(root, tmp_path, monkeypat
     monkeypatch.chdir(tmp_path)
     episodes = next((root / "episodes").iterdir())
     assert main(["import", str(episodes), "--out", "mine"]) == 0
-    small = ("--frames.encoder", "20", "--frames.policy", "20", "--processes", "1")
+    small = ("--frames.encoder", "20", "--frames.policy", "20", "--workers", "1")
     assert main(["card", "--profile", "smoke", "--data", "mine", *small]) == 0
     assert "4 episodes" in capsys.readouterr().out
     assert main(["preview", "--profile", "smoke", "--data", "mine", *small]) == 0

@@ -2,9 +2,12 @@
 
 import pytest
 
+from study.config import Cell, StudySettings
 from study.display import Display
+from study.stages import CELL_STAGES, ENCODER, Work, share_done
 
 COSTS = {"a": 100.0, "b": 100.0}
+WORKS = {key: Work(StudySettings(), Cell(heads="rec"), 15) for key in COSTS}
 LABELS = {"a": "rec 100% e0", "b": "full 100% e0", "c": "rec+plan 100% e0"}
 
 
@@ -16,22 +19,23 @@ def clock(monkeypatch):
 
 
 def test_time_left_follows_what_was_measured(clock):
-    with Display("heads", COSTS, LABELS, 0.0) as display:
+    with Display("heads", COSTS, LABELS, 0.0, WORKS) as display:
         assert display.left() is None
         display.start("a")
         display.progress("a", "encoder", 0, 10)
         clock[0] += 400
-        display.progress("a", "policy", 10, 10)
-        assert display.left() == pytest.approx(400)  # twice as slow as expected, half is done
+        display.progress("a", "result", 1, 1)
+        assert display.left() == pytest.approx(400)  # four times as slow as expected, half is done
 
 
 def test_what_was_done_before_a_restart_does_not_count_as_speed(clock):
-    with Display("heads", {"a": 100.0}, LABELS, 0.0) as display:
+    encoder = share_done(CELL_STAGES, WORKS["a"], ENCODER, 1.0)
+    with Display("heads", {"a": 100.0}, LABELS, 0.0, WORKS) as display:
         display.start("a")
         display.progress("a", "encoder", 5, 10)
         clock[0] += 40
         display.progress("a", "encoder", 10, 10)
-        assert display.left() == pytest.approx(20)
+        assert display.left() == pytest.approx(40 * (1 - encoder) / (encoder / 2))
 
 
 def test_plain_lines_count_the_cells(clock, capsys):
@@ -54,3 +58,17 @@ def test_the_data_line_tells_rate_and_time_left(clock, capsys):
         display.data("record", 75, 100)
         assert display.left() == pytest.approx(80)
     assert "recording drives 75/100, 0.62/s" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("stages", [("record", "select", "render", "describe"), ("record", "select", "render")])
+def test_data_that_is_made_leaves_nothing_to_wait_for_or_to_show(clock, capsys, stages):
+    """With the cells' own time left alone, whether or not the data are described."""
+    with Display("heads", {"a": 100.0}, LABELS, 100.0, WORKS) as display:
+        for stage in stages:
+            display.data(stage, 0, 10)
+            clock[0] += 100 / len(stages)
+            display.data(stage, 10, 10)
+        assert display.left() == pytest.approx(100)
+        capsys.readouterr()
+        display.tick(now=True)
+    assert capsys.readouterr().err.split("  ")[1].startswith("waiting; cells 0/1")

@@ -15,8 +15,10 @@ import pytest
 from drives import write_drives
 from study.birdview import render_birdview
 from study.config import FORMAT_VERSIONS, BadInputError, BirdviewSettings, FramesSettings
+from study.engine.cluster import local_engine
+from study.engine.flows import run_flow
 from study.episode import episode_digest, read_episode
-from study.frames import build_frames, epoch_order, open_frames, unpack_masks
+from study.frames import epoch_order, frames_flow, open_frames, unpack_masks
 from study.selection import LABELS
 
 FRAMES = FramesSettings(encoder=120, policy=60, spacing=0.5)
@@ -32,7 +34,7 @@ def drives(tmp_path_factory):
 @pytest.fixture(scope="module")
 def built(drives, tmp_path_factory):
     folder = tmp_path_factory.mktemp("stores") / "store"
-    build_frames(FRAMES, VIEW, *drives, folder, 1)
+    run_flow(frames_flow(FRAMES, VIEW, *drives, folder))
     return folder
 
 
@@ -70,63 +72,64 @@ def test_the_manifest_tells_what_the_store_is(built, drives):
         assert 0 <= entry["chosen"]["test"]["steering_beyond_crop"] < entry["chosen"]["test"]["majority_accuracy"] <= 1
 
 
-def test_processes_do_not_change_the_store(built, drives, tmp_path):
-    build_frames(FRAMES, VIEW, *drives, tmp_path / "two", 2)
+def test_workers_do_not_change_the_store(built, drives, tmp_path):
+    with local_engine(2, tmp_path / "scratch") as engine:
+        run_flow(frames_flow(FRAMES, VIEW, *drives, tmp_path / "stores" / "two"), engine)
     for file in sorted(path.relative_to(built) for path in built.rglob("*") if path.is_file()):
-        assert (tmp_path / "two" / file).read_bytes() == (built / file).read_bytes(), file
-    assert sorted(path.name for path in tmp_path.iterdir()) == [".lock", "two"]
+        assert (tmp_path / "stores" / "two" / file).read_bytes() == (built / file).read_bytes(), file
+    assert sorted(path.name for path in (tmp_path / "stores").iterdir()) == [".lock", "two"]
 
 
 def test_a_second_build_does_nothing(built, drives):
     before = {path: path.stat().st_mtime_ns for path in built.rglob("*")}
-    build_frames(FRAMES, VIEW, *drives, built, 1, lambda *_: pytest.fail("something was done"))
+    run_flow(frames_flow(FRAMES, VIEW, *drives, built), progress=lambda *_: pytest.fail("something was done"))
     assert {path: path.stat().st_mtime_ns for path in built.rglob("*")} == before
 
 
 def test_a_key_may_be_given(drives, tmp_path):
-    build_frames(FRAMES, VIEW, *drives, tmp_path / "store", 1, key="abc")
+    run_flow(frames_flow(FRAMES, VIEW, *drives, tmp_path / "store", key="abc"))
     assert open_frames(tmp_path / "store").key == "abc"
 
 
 KILLED = """
 import os, signal, sys
+from contextlib import nullcontext
 from pathlib import Path
 from study.config import BirdviewSettings, FramesSettings
-from study.frames import build_frames
+from study.engine.cluster import local_engine
+from study.engine.flows import run_flow
+from study.frames import frames_flow
 
 def progress(stage, done, total):
     if stage == sys.argv[2] and done >= int(sys.argv[3]):
         os.kill(os.getpid(), signal.SIGKILL)
 
 if __name__ == "__main__":
-    paths = [Path(path) for path in sys.argv[5:]]
-    build_frames(
-        FramesSettings(encoder=120, policy=60, spacing=0.5), BirdviewSettings(), paths[:5], paths[5:],
-        Path(sys.argv[1]), int(sys.argv[4]), progress,
-    )
+    folder, workers, paths = Path(sys.argv[1]), int(sys.argv[4]), [Path(path) for path in sys.argv[5:]]
+    frames = FramesSettings(encoder=120, policy=60, spacing=0.5)
+    with local_engine(workers, folder.parent / "scratch") if workers > 1 else nullcontext() as engine:
+        run_flow(frames_flow(frames, BirdviewSettings(), paths[:5], paths[5:], folder), engine, progress)
 """
 
 
-def start(script, folder, stage, done, processes, drives):
-    arguments = [str(folder), stage, str(done), str(processes), *map(str, (*drives[0], *drives[1]))]
+def start(script, folder, stage, done, workers, drives):
+    arguments = [str(folder), stage, str(done), str(workers), *map(str, (*drives[0], *drives[1]))]
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent.parent)}
     return subprocess.Popen([sys.executable, str(script), *arguments], env=environment)
 
 
-@pytest.mark.parametrize(("stage", "done", "processes"), [("select", 4, 1), ("render", 1, 1), ("render", 100, 2)])
-def test_a_killed_build_goes_on_and_ends_the_same(built, drives, tmp_path, stage, done, processes):
-    """Killed for real; what is rendered is not rendered again; a torn line of the journal is no harm."""
+@pytest.mark.parametrize(("stage", "done", "workers"), [("select", 4, 1), ("render", 1, 1), ("render", 100, 2)])
+def test_a_killed_build_goes_on_and_ends_the_same(built, drives, tmp_path, stage, done, workers):
+    """Killed for real; what is rendered is not rendered again; a note that is not whole is no harm."""
     script = tmp_path / "killed.py"
     script.write_text(KILLED)
     folder = tmp_path / "stores" / "store"
-    assert start(script, folder, stage, done, processes, drives).wait(timeout=60) == -signal.SIGKILL
+    assert start(script, folder, stage, done, workers, drives).wait(timeout=120) == -signal.SIGKILL
     assert not folder.exists()
-    journal = folder.with_name(".store.building") / "journal"
     if stage == "render":
-        with journal.open("a") as stream:
-            stream.write('{"set": "enc')
+        (folder.with_name(".store.building") / "parts" / "encoder-000000000.draft").write_text('{"start": 0, "ro')
     seen = []
-    build_frames(FRAMES, VIEW, *drives, folder, 1, lambda *what: seen.append(what))
+    run_flow(frames_flow(FRAMES, VIEW, *drives, folder), progress=lambda *what: seen.append(what))
     if stage == "render":
         assert seen[0][0] == "render"
         assert seen[0][1] >= done
@@ -136,8 +139,8 @@ def test_a_killed_build_goes_on_and_ends_the_same(built, drives, tmp_path, stage
 def test_an_unfinished_build_of_other_settings_is_not_taken_up(drives, tmp_path):
     script = tmp_path / "killed.py"
     script.write_text(KILLED)
-    start(script, tmp_path / "store", "render", 100, 1, drives).wait(timeout=60)
-    build_frames(FRAMES.model_copy(update={"seed": 1}), VIEW, *drives, tmp_path / "store", 1)
+    start(script, tmp_path / "store", "render", 100, 1, drives).wait(timeout=120)
+    run_flow(frames_flow(FRAMES.model_copy(update={"seed": 1}), VIEW, *drives, tmp_path / "store"))
     opened = open_frames(tmp_path / "store", check=True)
     assert opened.manifest["settings"]["frames"]["seed"] == 1
 
@@ -146,13 +149,13 @@ def test_two_builds_at_once_make_one_store(built, drives, tmp_path):
     script = tmp_path / "build.py"
     script.write_text(KILLED)
     both = [start(script, tmp_path / "store", "never", 0, 1, drives) for _ in range(2)]
-    assert [process.wait(timeout=60) for process in both] == [0, 0]
+    assert [process.wait(timeout=120) for process in both] == [0, 0]
     assert open_frames(tmp_path / "store", check=True).manifest == open_frames(built).manifest
 
 
 def test_no_drive_serves_both_sets(drives, tmp_path):
     with pytest.raises(BadInputError, match="drive-004 serves the encoder set and again the policy set"):
-        build_frames(FRAMES, VIEW, drives[0], [*drives[1], drives[0][4]], tmp_path / "store", 1)
+        run_flow(frames_flow(FRAMES, VIEW, drives[0], [*drives[1], drives[0][4]], tmp_path / "store"))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -166,19 +169,19 @@ def test_no_drive_serves_both_sets(drives, tmp_path):
 def test_what_cannot_be_met_is_refused(drives, tmp_path, settings, says):
     """Too little disk is seen before any work; neither leaves something that looks like a store."""
     with pytest.raises(BadInputError, match=says):
-        build_frames(FRAMES.model_copy(update=settings), VIEW, *drives, tmp_path / "store", 1)
+        run_flow(frames_flow(FRAMES.model_copy(update=settings), VIEW, *drives, tmp_path / "store"))
     assert not (tmp_path / "store").exists()
 
 
 def test_a_folder_that_cannot_be_written_is_one_clear_error(drives, tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(BadInputError, match="cannot write"):
-        build_frames(FRAMES, VIEW, *drives, tmp_path / "file" / "store", 1)
+        run_flow(frames_flow(FRAMES, VIEW, *drives, tmp_path / "file" / "store"))
 
 
 def test_a_folder_of_other_frames_is_left_alone(store, drives):
     with pytest.raises(BadInputError, match="other settings or drives"):
-        build_frames(FRAMES.model_copy(update={"seed": 5}), VIEW, *drives, store, 1)
+        run_flow(frames_flow(FRAMES.model_copy(update={"seed": 5}), VIEW, *drives, store))
     open_frames(store, check=True)
 
 
@@ -186,7 +189,7 @@ def test_a_broken_drive_is_named(drives, tmp_path):
     broken = Path(shutil.copytree(drives[0][0], tmp_path / "broken"))
     (broken / "states.parquet").write_bytes(b"PAR1")
     with pytest.raises(BadInputError, match=r"states\.parquet does not match"):
-        build_frames(FRAMES, VIEW, [broken, *drives[0][1:]], drives[1], tmp_path / "store", 1)
+        run_flow(frames_flow(FRAMES, VIEW, [broken, *drives[0][1:]], drives[1], tmp_path / "store"))
 
 
 def cut(path):

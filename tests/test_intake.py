@@ -111,29 +111,6 @@ def test_what_is_missing_is_listed_and_not_trained(here, plan, folder, empty_sto
     assert not (here / "data").exists()
 
 
-def test_a_sweep_that_goes_on_on_another_machine_is_left_to_it(here, plan, folder, database):
-    elsewhere = Tracker(database)
-    planned = (plan.grid, plan.profile, plan.settings, plan.cells)
-    theirs, ours = plan.cells
-    sweep = elsewhere.open_sweep(*planned, {}, {"commit": "c" * 40})
-    run = elsewhere.start_cell(sweep, plan.cells[theirs], theirs, plan.settings, 2)
-
-    def status(run_id):
-        return elsewhere.client.get_run(run_id).info.status
-
-    assert take_in(plan, folder, [ours], Tracker(database)) == [theirs]
-    assert (status(sweep), status(run.run_id)) == ("RUNNING", "RUNNING")
-    assert elsewhere.read_sweep("heads").provenance["commit"] == "c" * 40
-    assert elsewhere.read_sweep("heads").results.keys() == {ours}
-
-    elsewhere.interrupt(run)
-    elsewhere.close_sweep(sweep, "KILLED")
-    assert take_in(plan, folder, [], Tracker(database)) == [theirs]
-    assert status(sweep) == "KILLED"
-    assert take_in(plan, folder, [theirs, ours], Tracker(database)) == []
-    assert status(sweep) == "FINISHED"
-
-
 def damage(path):
     content = bytearray(path.read_bytes())
     content[-1] ^= 1
@@ -152,7 +129,7 @@ def edit(change):
 
 SPOILT = {
     "a flipped bit": (lambda folder: damage(folder / "encoder.safetensors"), "does not match its digest"),
-    "a missing file": (lambda folder: (folder / "curves.parquet").unlink(), "no whole cell result"),
+    "a missing file": (lambda folder: (folder / "curves.parquet").unlink(), "is not a whole product"),
     "another name": (lambda folder: folder.rename(folder.with_name("0" * 16)), "give the folder its own name"),
     "another cell": (
         edit(lambda result: dataclasses.replace(result, cell=result.cell.model_copy(update={"encoder_seed": 7}))),

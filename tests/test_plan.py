@@ -5,7 +5,7 @@ import shlex
 import pytest
 
 from study.config import BadInputError
-from study.plan import given_plan, thread_hint
+from study.plan import given_plan
 from study.provenance import cores
 from study.sweep import main, parser
 
@@ -16,15 +16,24 @@ def test_threads_do_not_depend_on_the_number_of_workers():
     assert one.threads == four.threads <= cores()
 
 
-def test_too_many_threads_are_told_with_what_to_do():
-    assert "--threads 1" in thread_hint(4, 2, 2)
-    assert "--threads 3" in thread_hint(2, 4, 7)
-    assert thread_hint(4, 2, 8) == thread_hint(4, 1, 2) == ""
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--threads", "0"], "--threads is 0"),
+        (["--workers", "0"], "--workers is 0"),
+        (["--workers", "2", "--cluster", "tls://host:8786"], "leave one of them out"),
+        (["--certificates", "here"], "--certificates goes with --cluster tls://"),
+        (["--certificates", "here", "--cluster", "tcp://127.0.0.1:8786"], "--certificates goes with --cluster tls://"),
+        (["--device", "cuda:99"], "choose from cpu"),
+    ],
+)
+def test_options_that_cannot_be_used_are_refused_before_anything_runs(words, says):
+    with pytest.raises(BadInputError, match=says):
+        main(["heads", *words, "--dry-run"])
 
 
-def test_a_cell_needs_a_thread():
-    with pytest.raises(BadInputError, match="--threads is 0"):
-        main(["heads", "--threads", "0", "--dry-run"])
+def test_a_device_of_the_cluster_need_not_be_on_this_machine():
+    assert main(["heads", "--device", "cuda:99", "--cluster", "tls://host:8786", "--dry-run"]) == 0
 
 
 def test_a_plans_command_makes_the_same_plan():

@@ -4,12 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import multiprocessing
-import os
-import subprocess
-import sys
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,7 +14,7 @@ from torch import nn
 from torch.nn import functional
 
 from study import policy
-from study.config import BadInputError, PolicySettings
+from study.config import BadInputError, PolicySettings, TrainingDivergedError
 from study.policy import (
     METRICS,
     WIDTHS,
@@ -32,6 +26,7 @@ from study.policy import (
     dropped,
     forward_backward,
     initial_weights,
+    join_policies,
     likeliest,
     measure,
     normalisation,
@@ -39,7 +34,7 @@ from study.policy import (
     predict,
     train_policies,
 )
-from study.result import CURVE_COLUMNS, TrainingDivergedError
+from study.result import CURVE_COLUMNS
 from waiting import questions
 
 SETTINGS = PolicySettings(epochs=5, batch=64, lr=5e-3)
@@ -96,76 +91,23 @@ def test_neither_order_nor_number_of_cores_changes_a_seed(fifteen: TrainedPolici
     np.testing.assert_array_equal(few.steering, fifteen.steering[[12, 3]])
 
 
-@pytest.fixture
-def two_processes(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Two cores, and every work worth a process."""
-    monkeypatch.setattr(policy, "_WORTH", 0)
-    monkeypatch.setattr(policy, "cores", lambda: 2)
-    threads = torch.get_num_threads()
-    torch.set_num_threads(2)
-    yield
-    torch.set_num_threads(threads)
+@pytest.mark.parametrize("shares", [[[3, 1, 2]], [[3], [1, 2]], [[3, 1], [2]], [[3], [1], [2]]])
+def test_policies_trained_in_shares_and_joined_are_those_trained_at_once(shares: list[list[int]]) -> None:
+    """Byte for byte, and row for row of the curves."""
+    once = train([3, 1, 2])
+    joined = join_policies([train(share) for share in shares])
+    assert list(joined.weights) == list(once.weights)
+    for name, weights in once.weights.items():
+        assert joined.weights[name].dtype == weights.dtype
+        assert joined.weights[name].tobytes() == weights.tobytes(), name
+    assert joined.steering.tobytes() == once.steering.tobytes()
+    assert joined.acceleration.tobytes() == once.acceleration.tobytes()
+    pd.testing.assert_frame_equal(joined.curves, once.curves, check_exact=True)
 
 
-def test_two_processes_give_the_same_bytes_as_one(
-    two_processes: None, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    heard = []
-    shared = train([3, 1, 2], log=lambda *what: heard.append(what))
-    assert not multiprocessing.active_children()
-    assert capfd.readouterr() == ("", "")
-    monkeypatch.setattr(policy, "_WORTH", float("inf"))
-    told = []
-    alone = train([3, 1, 2], log=lambda *what: told.append(what))
-    assert heard == told
-    assert all(shared.weights[name].tobytes() == alone.weights[name].tobytes() for name in alone.weights)
-    assert shared.steering.tobytes() == alone.steering.tobytes()
-    assert shared.acceleration.tobytes() == alone.acceleration.tobytes()
-    pd.testing.assert_frame_equal(shared.curves, alone.curves, check_exact=True)
-
-
-def test_a_killed_process_is_named_by_its_seeds(two_processes: None) -> None:
-    def kill(*_: Any) -> None:
-        for process in multiprocessing.active_children():
-            process.kill()
-
-    with pytest.raises(ChildProcessError, match=r"seeds \[5\] ended with code -9"):
-        train([4, 5], SETTINGS.model_copy(update={"epochs": 2000}), log=kill)
-
-
-ENDLESS = """
-import multiprocessing, torch
-from test_policy import SETTINGS, policy, train
-def tell(*_):
-    print(len(multiprocessing.active_children()), flush=True)
-if __name__ == "__main__":
-    policy._WORTH, policy.cores = 0, lambda: 2
-    torch.set_num_threads(2)
-    train([0, 1], SETTINGS.model_copy(update={"epochs": 100_000}), log=tell)
-"""
-
-
-def test_no_process_outlives_one_that_was_killed(tmp_path: Path) -> None:
-    (tmp_path / "endless.py").write_text(ENDLESS)
-    path = os.pathsep.join([str(Path(__file__).parent), str(Path(__file__).parents[1])])
-    with subprocess.Popen(
-        [sys.executable, tmp_path / "endless.py"], env=os.environ | {"PYTHONPATH": path}, stdout=subprocess.PIPE
-    ) as process:
-        assert process.stdout
-        assert process.stdout.readline() == b"1\n"
-        process.kill()
-        process.communicate(timeout=20)  # it ends when the last process that could write has ended
-
-
-def test_little_work_and_one_thread_stay_in_one_process(two_processes: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert policy._processes(15, 10**6, "cpu") == 2  # noqa: SLF001
-    assert policy._processes(15, 10**6, "cuda") == 1  # noqa: SLF001
-    assert policy._processes(1, 10**9, "cpu") == 1  # noqa: SLF001
-    torch.set_num_threads(1)
-    assert policy._processes(15, 10**6, "cpu") == 1  # noqa: SLF001
-    torch.set_num_threads(2)
-    monkeypatch.undo()
-    assert policy._processes(15, TRAIN * SETTINGS.epochs, "cpu") == 1  # noqa: SLF001
+def test_joined_policies_took_the_time_of_all_shares() -> None:
+    shares = [dataclasses.replace(train([seed]), seconds=seed + 0.5) for seed in (1, 2)]
+    assert join_policies(shares).seconds == 4.0
 
 
 def test_all_seeds_as_one_group_come_out_as_one_group_each(

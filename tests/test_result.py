@@ -47,7 +47,7 @@ def test_what_is_not_whole_is_refused(folder, file, how):
         path.unlink()
     else:
         path.write_bytes(path.read_bytes()[:-9])
-    with pytest.raises(BadInputError, match="no whole cell result"):
+    with pytest.raises(BadInputError, match=r"is not a whole product: .*; run the cell again"):
         CellResult.load(folder)
 
 

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from study.config import ACCELERATIONS, BadInputError, RecordingSettings, TownSettings
+from study.engine.flows import run_flow
 from study.episode import Episode, check_episode, read_episode
 from study.sim.autopilot import LOOK
-from study.sim.record import FORMAT_VERSION, record_all, record_episode
+from study.sim.record import FORMAT_VERSION, record_episode, record_flow
 
 TOWN = TownSettings(vehicles=30)
 TINY = TownSettings(rows=3, columns=3, dropped_edges=0, vehicles=6)
@@ -142,10 +143,8 @@ def test_the_drive_of_a_seed_is_the_one_that_its_format_version_stands_for() -> 
 def test_recordings_that_cannot_be_are_refused(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="shorter than one step"):
         record_episode(TINY, RecordingSettings(warm_up=0, duration=0.01), 0)
-    with pytest.raises(BadInputError, match="processes"):
-        record_all(TINY, SHORT, [0], tmp_path, processes=0)
     with pytest.raises(BadInputError, match="speed_limit"):
-        record_all(TownSettings(speed_limit=200.0), SHORT, [0], tmp_path)
+        run_flow(record_flow(TownSettings(speed_limit=200.0), SHORT, [0], tmp_path))
 
 
 # --- many drives ----------------------------------------------------------------------------------------------------
@@ -155,28 +154,29 @@ def bytes_of(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
-def test_the_number_of_processes_makes_no_difference(tmp_path: Path) -> None:
-    one = record_all(TINY, SHORT, [3, 1, 2], tmp_path / "one", processes=1)
-    two = record_all(TINY, SHORT, [3, 1, 2], tmp_path / "two", processes=2)
-    assert [path.name for path in one] == [path.name for path in two] == ["00000003", "00000001", "00000002"]
+def test_the_order_of_the_seeds_changes_no_drive(tmp_path: Path) -> None:
+    one = run_flow(record_flow(TINY, SHORT, [3, 1, 2], tmp_path / "one"))
+    two = run_flow(record_flow(TINY, SHORT, [2, 3, 1], tmp_path / "two"))
+    assert [path.name for path in one] == ["00000003", "00000001", "00000002"]
+    assert [path.name for path in two] == ["00000002", "00000003", "00000001"]
     assert bytes_of(tmp_path / "one") == bytes_of(tmp_path / "two")
 
 
 def test_only_missing_drives_are_recorded_and_drafts_of_the_dead_are_swept(tmp_path: Path) -> None:
     folder = tmp_path / "drives"
-    first = record_all(TINY, SHORT, [1, 2], folder, processes=1)
+    first = run_flow(record_flow(TINY, SHORT, [1, 2], folder))
     stamp = (first[0] / "episode.json").stat().st_mtime_ns
     whole = bytes_of(first[0])
     draft = folder / ".00000009.abc"
     draft.mkdir()
-    seen: list[tuple[int, int]] = []
+    seen: list[tuple[str, int, int]] = []
 
-    def progress(done: int, total: int) -> None:
-        seen.append((done, total))
-        (folder / ".00000003.def").mkdir(exist_ok=True)  # as a child that is killed in this moment
+    def progress(stage: str, done: int, total: int) -> None:
+        seen.append((stage, done, total))
+        (folder / ".00000003.def").mkdir(exist_ok=True)  # as a worker that is killed in this moment
 
-    paths = record_all(TINY, SHORT, [1, 2, 3], folder, processes=1, progress=progress)
-    assert seen == [(2, 3), (3, 3)]
+    paths = run_flow(record_flow(TINY, SHORT, [1, 2, 3], folder), progress=progress)
+    assert seen == [("record", 2, 3), ("record", 3, 3)]
     assert (first[0] / "episode.json").stat().st_mtime_ns == stamp
     assert bytes_of(first[0]) == whole
     assert list(folder.glob(".*/")) == []

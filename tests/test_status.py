@@ -41,7 +41,6 @@ def left(attempts):
         ([attempt("FINISHED"), attempt("KILLED")], "finished"),
         ([attempt("FAILED"), attempt("RUNNING")], "running"),
         ([attempt("RUNNING"), attempt("FAILED")], "failed"),
-        ([attempt("FAILED", tags={"again": "true"})], "waiting"),
         ([attempt("KILLED")], "waiting"),
         ([attempt("RUNNING", quiet=SILENT + 1)], "silent"),
         ([attempt("RUNNING", host="here")], "dead"),

@@ -249,11 +249,9 @@ def test_a_result_of_another_cell_is_refused(tracker):
 
 
 @pytest.fixture
-def network(tmp_path):
+def network():
     """Stands for an exported network; the tracker does not look inside."""
-    file = tmp_path / "network.pt2"
-    file.write_bytes(b"a graph and its weights")
-    return file
+    return b"a graph and its weights"
 
 
 def models(tracker):
@@ -279,7 +277,7 @@ def test_a_committed_cell_has_its_model_with_its_scores(tracker, network):
     run = tracker.client.get_run(run_id)
     assert [output.model_id for output in run.outputs.model_outputs] == [model.model_id]
     for address in (f"runs:/{run_id}/driver", f"models:/{model.model_id}"):
-        assert network_at(tracker, address).read_bytes() == network.read_bytes()
+        assert network_at(tracker, address).read_bytes() == network
 
 
 def test_a_commit_that_broke_off_is_repeated_with_one_model(tracker, network):
@@ -354,6 +352,19 @@ def test_a_failed_cell_is_listed_with_its_reason_until_it_is_finished(tracker):
     assert "secret" not in reason
     train(tracker, sweep, planned, "fail-0")
     assert tracker.read_sweep("heads").failed == {}
+
+
+def test_a_cell_that_failed_for_good_is_given_up_until_it_is_tried_again(tracker):
+    planned = cells("permanent")
+    sweep = open_sweep(tracker, planned)
+    tracker.fail(start(tracker, sweep, planned, "permanent-0"), "no room", permanent=False)
+    assert tracker.given_up(planned) == {}
+    tracker.fail(start(tracker, sweep, planned, "permanent-0"), "loss is nan", permanent=True)
+    assert tracker.given_up(planned) == {"permanent-0": "loss is nan"}
+    again = start(tracker, sweep, planned, "permanent-0")  # as --retry-failed does
+    assert tracker.given_up(planned) == {}
+    tracker.interrupt(again)
+    assert tracker.given_up(planned) == {}
 
 
 def test_uncommitted_changes_are_kept_with_the_cell_that_they_made(tracker):

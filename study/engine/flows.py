@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 from study.command import check_stopped
 from study.config import BadInputError, TrainingDivergedError
 from study.engine.inline import InlineEngine
-from study.engine.tasks import Engine, Failure
+from study.engine.tasks import Engine, Failure, failure_of
 from study.stages import Batch, Flow, Task
 
 TRIES = 3
@@ -134,10 +134,8 @@ class _Flows:
                 batch = running.flow.send([])
         except StopIteration as end:
             self._listener.finished(running.name, end.value)
-        except (BadInputError, TrainingDivergedError) as error:
-            self._listener.failed(running.name, Failure(str(error), transient=False))
-        except OSError as error:
-            self._listener.failed(running.name, Failure(str(error), transient=True))
+        except (BadInputError, TrainingDivergedError, OSError) as error:
+            self._listener.failed(running.name, failure_of(error))
         else:
             running.batch, running.results, running.shares, running.total = batch, {}, {}, 0
             running.logs.clear()

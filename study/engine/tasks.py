@@ -60,14 +60,17 @@ def perform(task: Task, report: Callable[..., None]) -> Any:
     report("start", platform.node(), os.getpid())
     try:
         return task.function(*task.args, *([report] if task.reports else []))
-    except (BadInputError, TrainingDivergedError) as error:
-        return Failure(str(error), transient=False)
-    except OSError as error:
-        if error.errno in WRITE_ERRORS:
-            return Failure(cannot_write(Path(error.filename or "a file"), error), transient=True)
-        return Failure(traceback.format_exc(), transient=True, expected=False)
-    except MemoryError:
-        return Failure(traceback.format_exc(), transient=True, expected=False)
     except Exception as error:  # noqa: BLE001 - whatever it is belongs to this task, and the others go on
-        transient = isinstance(error, RuntimeError) and any(words in str(error).lower() for words in NO_MEMORY)
-        return Failure(traceback.format_exc(), transient=transient, expected=False)
+        return failure_of(error)
+
+
+def failure_of(error: Exception) -> Failure:
+    """Return what an exception means: whether another try may succeed, and the reason, a traceback where need be."""
+    if isinstance(error, BadInputError | TrainingDivergedError):
+        return Failure(str(error), transient=False)
+    if isinstance(error, OSError) and error.errno in WRITE_ERRORS:
+        return Failure(cannot_write(Path(error.filename or "a file"), error), transient=True)
+    transient = isinstance(error, OSError | MemoryError) or (
+        isinstance(error, RuntimeError) and any(words in str(error).lower() for words in NO_MEMORY)
+    )
+    return Failure("".join(traceback.format_exception(error)), transient, expected=False)
