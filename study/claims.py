@@ -154,11 +154,9 @@ def _episodes(record: SweepRecord, first: Point, second: Point) -> Estimate:
     """Return the difference in accuracy after the last epoch, with its interval over test drives of the same weight."""
 
     def accuracy(point: Point) -> pd.Series:
-        guesses = [result.predictions for result in results_at(record, point)]
         names = ("acceleration", "acceleration_label", "episode")
-        return pd.concat([stats.episode_accuracy(*(guess[name] for name in names)) for guess in guesses], axis=1).mean(
-            axis=1
-        )
+        guesses = [[result.predictions[name] for name in names] for result in results_at(record, point)]
+        return pd.concat([stats.episode_accuracy(*guess) for guess in guesses], axis=1).mean(axis=1)
 
     return stats.t_interval(stats.paired(accuracy(first), accuracy(second)).to_numpy(np.float64), "t, over test drives")
 
@@ -333,16 +331,9 @@ def _reach(evidence: Evidence, shares: Mapping[Point, float]) -> list[Finding]:
         # The baseline itself, even were its encoder better by the allowance, must be slower: else speed shows nothing.
         distinct = in_time and own.low > epoch.high and goal - mean[int(epoch.high) - 1] > more
         behind = float(curves.mean().iloc[: max(int(bound), 1)].max()) + more < goal
-        findings.append(
-            Finding(
-                f"{label(point, evidence.grid)} reaches {label(evidence.rec, evidence.grid)}'s final",
-                "epochs",
-                epoch,
-                (epoch.low, epoch.high),
-                f"at most {bound:g}",
-                _state(bool(distinct), epoch.low > bound and behind),
-            )
-        )
+        what = f"{label(point, evidence.grid)} reaches {label(evidence.rec, evidence.grid)}'s final"
+        state = _state(bool(distinct), epoch.low > bound and behind)
+        findings.append(Finding(what, "epochs", epoch, (epoch.low, epoch.high), f"at most {bound:g}", state))
     return findings
 
 
@@ -350,23 +341,15 @@ def _most_spread(evidence: Evidence, points: Sequence[Point]) -> list[Finding]:
     """Return findings that the baseline's policies vary more than each other's, over the epochs of its transient."""
     rules, base = evidence.rules, evidence.accuracy[evidence.rec]
     epochs = stats.transient(base)
-    others = [point for point in points if point != evidence.rec]
-    findings = []
+    others, findings = [point for point in points if point != evidence.rec], []
     for point in others:
         curves = evidence.accuracy[point]
         decides = stats.spread_ratio(base, curves, epochs, 1 - rules.alpha / len(others))
         factor = rules.spread_factor if evidence.one_encoder(point, evidence.rec) else 1.0
         low, high = decides.low / factor, decides.high * factor
-        findings.append(
-            Finding(
-                f"variance of {evidence.rec[0]} over {point[0]}, epochs 1 to {epochs}",
-                "ratio",
-                stats.spread_ratio(base, curves, epochs),
-                (low, high),
-                "above 1",
-                _state(low > 1, high < 1),
-            )
-        )
+        what = f"variance of {evidence.rec[0]} over {point[0]}, epochs 1 to {epochs}"
+        ratio = stats.spread_ratio(base, curves, epochs)
+        findings.append(Finding(what, "ratio", ratio, (low, high), "above 1", _state(low > 1, high < 1)))
     return findings
 
 

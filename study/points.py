@@ -23,16 +23,15 @@ COMMIT = "mlflow.source.git.commit"
 
 
 def scores_of(result: CellResult) -> pd.DataFrame:
-    """Mean of the last five epochs on test frames (Sec. V-B): one row per policy seed, one column per metric."""
-    from study.stats import final_scores  # noqa: PLC0415 - scipy, which reading what is finished does not need
+    """Return the final scores on test frames (Sec. V-B): one row per policy seed, one column per metric."""
+    from study.stats import final  # noqa: PLC0415 - scipy, which reading what is finished does not need
 
-    cell = result.cell
-    table = result.curves.assign(heads=cell.heads, fraction=cell.fraction, encoder_seed=cell.encoder_seed)
-    return final_scores(table).pivot_table(index="policy_seed", columns="metric", values="value")
+    rows = result.curves[(result.curves["split"] == "test") & (result.curves["stage"] == "policy")]
+    return final(rows.pivot_table(index=["policy_seed", "metric"], columns="epoch", values="value")).unstack("metric")  # noqa: PD010
 
 
 def bands(values: pd.DataFrame) -> dict[str, Numbers]:
-    """Mean, and `/sd`, `/low`, `/high`, over the seeds (rows), of each column; the ends are NaN for one seed."""
+    """Return mean, `/sd`, `/low` and `/high` over the seeds (rows) of each column; the ends are NaN for one seed."""
     from study.stats import t_limits  # noqa: PLC0415 - as above
 
     low, high = t_limits(values.to_numpy(np.float64))

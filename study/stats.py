@@ -76,19 +76,8 @@ def panel(table: pd.DataFrame, metric: str, split: str = "test", stage: str = "p
     return curves
 
 
-def final_scores(table: pd.DataFrame, last: int = LAST) -> pd.DataFrame:
-    """Return the mean of the last epochs on the test split, for each cell, policy seed and metric (Sec. V-B).
-
-    Columns heads, fraction, encoder_seed, policy_seed, metric, value; in the order of the table.
-    """
-    keys = ["heads", "fraction", "encoder_seed", "policy_seed", "metric"]
-    part = table[(table["split"] == "test") & (table["stage"] == "policy")]
-    late = part[part["epoch"] > part.groupby(keys, sort=False)["epoch"].transform("max") - last]
-    return late.groupby(keys, sort=False)["value"].mean().reset_index()
-
-
 def final(curves: pd.DataFrame, last: int = LAST) -> pd.Series:
-    """Return the final score of each seed of a panel's frame."""
+    """Return the final score of each seed of a panel's frame: the mean of the last epochs (Sec. V-B)."""
     return curves.iloc[:, -last:].mean(axis=1)
 
 

@@ -12,6 +12,7 @@ from statsmodels.stats.weightstats import DescrStatsW
 
 from simulated import DATASIZE_GRID, HEADS_GRID, Null, World, simulate
 from study import stats
+from study.points import scores_of
 from study.result import TABLE_COLUMNS
 
 PAIR = HEADS_GRID.model_copy(update={"heads": ("rec", "full")})
@@ -37,7 +38,8 @@ def frame(values, encoders=1):
 
 def test_final_scores_are_means_of_the_last_epochs_of_each_seed(record):
     table = record.table()
-    scores = stats.final_scores(table)
+    scores = {key: scores_of(result) for key, result in record.results.items()}
+    (full,) = (scores[key] for key, cell in record.planned.items() if cell.heads == "full")
     one = table[
         (table["heads"] == "full")
         & (table["policy_seed"] == 3)
@@ -45,10 +47,9 @@ def test_final_scores_are_means_of_the_last_epochs_of_each_seed(record):
         & (table["metric"] == stats.ACCURACY)
         & (table["epoch"] > 95)
     ]
-    found = scores[(scores["heads"] == "full") & (scores["policy_seed"] == 3) & (scores["metric"] == stats.ACCURACY)]
     assert len(one) == 5
-    assert found["value"].item() == pytest.approx(one["value"].mean())
-    assert len(scores) == 4 * 15 * 4  # cells, seeds, metrics
+    assert full.loc[3, stats.ACCURACY] == pytest.approx(one["value"].mean())
+    assert [each.shape for each in scores.values()] == [(15, 4)] * 5  # seeds and metrics of each cell and the ceiling
 
 
 def test_a_panel_does_not_depend_on_the_order_of_the_rows(record):
