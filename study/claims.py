@@ -12,13 +12,13 @@ import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import pandas as pd
 
 from study import stats
-from study.config import HEAD_SETS, Grid, Rules
+from study.config import HEAD_SETS, FromJson, Grid, Number, Rules
 from study.result import CellResult, SweepRecord
 from study.stats import ACCURACY, STEERING, Estimate, Panel, Point
 
@@ -26,6 +26,7 @@ State = Literal["holds", "fails", "open"]
 Outcome = Literal["reproduced", "not reproduced", "inconclusive", "not tested"]
 OUTCOMES: tuple[Outcome, ...] = ("reproduced", "not reproduced", "inconclusive", "not tested")
 Unit = Literal["points", "loss", "epochs", "ratio"]
+Interval = Annotated[Estimate, FromJson]  # the same value, that pydantic can read back from a report.json
 
 MINUS = "\N{MINUS SIGN}"
 CLAIMS = {
@@ -50,11 +51,11 @@ class Finding:
 
     what: str
     unit: Unit
-    estimate: Estimate
-    decides: tuple[float, float]
+    estimate: Interval
+    decides: tuple[Number, Number]
     needs: str
     state: State
-    p: float = math.nan
+    p: Number = math.nan
 
 
 @dataclass(frozen=True)
@@ -79,23 +80,29 @@ class Contrast:
     `simultaneous`: t interval for all planned contrasts of the metric together; `episodes`: interval over test drives.
     """
 
+    name: str
     metric: str
     first: Point
     second: Point
-    difference: Estimate
-    simultaneous: tuple[float, float]
-    p: float
-    p_holm: float
-    improvement: float
-    detectable: float
-    hierarchical: Estimate | None
-    episodes: Estimate | None
+    difference: Interval
+    simultaneous: tuple[Number, Number]
+    p: Number
+    p_holm: Number
+    improvement: Number
+    detectable: Number
+    hierarchical: Interval | None
+    episodes: Interval | None
 
 
 def label(point: Point, grid: Grid) -> str:
     """A cell's name for people; the fraction only where the sweep has several."""
     heads, fraction = point
     return heads if len(grid.fractions) == 1 else f"{heads} at {fraction * 100:g} %"
+
+
+def difference_label(first: Point, second: Point, grid: Grid) -> str:
+    """Return the name for people of a difference, first minus second."""
+    return f"{label(first, grid)} {MINUS} {label(second, grid)}"
 
 
 # --- comparisons ----------------------------------------------------------------------------------------------------
@@ -131,6 +138,7 @@ def compare(record: SweepRecord, metric: str, curves: Panel) -> list[Contrast]:
     level = 1 - record.grid.rules.alpha / max(len(plan), 1)
     return [
         Contrast(
+            difference_label(first, second, record.grid),
             metric,
             first,
             second,
@@ -298,7 +306,7 @@ def _above(evidence: Evidence, pairs: Iterable[tuple[Point, Point]]) -> list[Fin
         low, high = low - more, high + more
         findings.append(
             Finding(
-                f"{label(first, evidence.grid)} {MINUS} {label(second, evidence.grid)}",
+                difference_label(first, second, evidence.grid),
                 "points",
                 stats.mean_interval(values),
                 (low, high),
@@ -323,7 +331,7 @@ def _same_steering(evidence: Evidence, points: Sequence[Point]) -> list[Finding]
         low, high = _t(units, 1 - rules.alpha / len(others))
         findings.append(
             Finding(
-                f"{label(point, evidence.grid)} {MINUS} {label(base, evidence.grid)}",
+                difference_label(point, base, evidence.grid),
                 "loss",
                 stats.mean_interval(values),
                 (low, high),
