@@ -21,7 +21,7 @@ def plain(text: object) -> Inline:
     """Return words from outside as inline Markdown that shows them as they are; Inline stays as it is."""
     if isinstance(text, Inline):
         return text
-    return Inline(re.sub(r"([\\`*_\[\]|~#<&])", r"\\\1", " ".join(str(text).split())))
+    return Inline(re.sub(r"([\\`*_\[\]|~#<&])", r"\\\1", re.sub(r"\s+", " ", str(text))))
 
 
 def code(text: object) -> Inline:
@@ -97,12 +97,11 @@ def table(header: Sequence[str], rows: Sequence[Row], left: int = 1) -> list[Tab
     return [Table(tuple(header), align, tuple(tuple(map(plain, row)) for row in rows))]
 
 
-def parse(text: str, rows: Mapping[str, Sequence[Row]], pictures: Mapping[str, Sequence[Picture]]) -> Iterator[Block]:
+def parse(text: str, pictures: Mapping[str, Sequence[Picture]]) -> Iterator[Block]:
     """Yield the blocks of a text, which blank lines separate.
 
-    `#` starts a heading and `>` a notice. `Figures PLACE` stands for the pictures of a place. `Table NAME: CAPTION` is
-    followed by a header, a line of alignments, rows, and notes; `rows` of that name are added to its own, and a table
-    without any row is left out.
+    `#` starts a heading and `>` a notice. `Figures PLACE` stands for the pictures of a place. `Table: CAPTION` is
+    followed by a header, a line of alignments, rows, and notes; a table without any row is left out.
     """
     for block in filter(None, (part.strip() for part in re.split(r"\n\s*\n", text))):
         words = " ".join(block.split())
@@ -110,13 +109,12 @@ def parse(text: str, rows: Mapping[str, Sequence[Row]], pictures: Mapping[str, S
             yield Heading(len(heading[1]), heading[2])
         elif words.startswith("Figures "):
             yield from pictures.get(words.removeprefix("Figures "), ())
-        elif found := re.fullmatch(r"Table ([^:]+):(.*?)((?:^\|[^\n]*\n?)+)(.*)", block, re.DOTALL | re.MULTILINE):
-            header, marks, *own = (_cells(line) for line in found[3].splitlines())
-            body = [*own, *(tuple(map(plain, row)) for row in rows.get(found[1], ()))]
-            caption, notes = (" ".join(part.split()) for part in (found[2], found[4]))
+        elif found := re.fullmatch(r"Table:(.*?)((?:^\|[^\n]*\n?)+)(.*)", block, re.DOTALL | re.MULTILINE):
+            header, marks, *rows = (_cells(line) for line in found[2].splitlines())
+            caption, notes = (" ".join(part.split()) for part in (found[1], found[3]))
             align = "".join("c" if mark[0] == ":" else "r" if mark[-1] == ":" else "l" for mark in marks)
-            if body:
-                yield Table(header, align, tuple(body), caption, notes)
+            if rows:
+                yield Table(header, align, tuple(rows), caption, notes)
         else:
             yield Paragraph(words.removeprefix("> "), words.startswith("> "))
 

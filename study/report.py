@@ -36,8 +36,8 @@ def build_report(record: SweepRecord, folder: Path = REPORTS) -> Path:
     from study.drawings import draw  # noqa: PLC0415
     from study.figures import save  # noqa: PLC0415
     from study.report_model import FigureText  # noqa: PLC0415
+    from study.report_text import document  # noqa: PLC0415
     from study.summary import summarise  # noqa: PLC0415
-    from study.tables import document  # noqa: PLC0415
 
     report, own = summarise(record), folder / record.grid.name
     drawings = draw(record, report)
@@ -91,19 +91,20 @@ def publish(tracker: Tracker, name: str, profile: str | None, folder: Path) -> P
 
 
 def _complete(tracker: Tracker, name: str, profile: str | None) -> SweepRecord:
-    """A sweep, and those that vary one of its confounds."""
+    """Return a sweep with those that vary one of its confounds."""
     record = tracker.read_sweep(name, profile)
     return replace(record, variants=tracker.read_variants(record))
 
 
 def parser() -> Parser:
-    """The command line."""
+    """Return the command line."""
     made = Parser(
         prog="study.report",
         usage="python -m study.report SWEEP [--profile P] [--format {pdf,md}] [--tracking URI] [--out DIR]\n"
         "       python -m study.report compare A B [--figure FILE] [--tracking URI]",
         description="Write the report of a sweep from what MLflow holds: PDF, figures, numbers and the tidy table; or "
-        "the report without its figures as Markdown on stdout; or set two sweeps side by side, as Markdown on stdout, with a picture.",
+        "the report without figures as Markdown on stdout; or set two sweeps side by side, as Markdown on stdout, with "
+        "a picture.",
         epilog="A and B: each a report.json, a folder that holds one, or NAME[:PROFILE][@URI] of a sweep in MLflow. "
         "Examples: python -m study.report heads --profile smoke; "
         "python -m study.report compare reports/reference/heads heads:laptop --figure both.svg > both.md",
@@ -149,8 +150,8 @@ def main(args: Sequence[str]) -> int:
     tracker = Tracker(options.tracking)
     if options.format == "md":
         from study.markdown import markdown  # noqa: PLC0415
+        from study.report_text import document  # noqa: PLC0415
         from study.summary import summarise  # noqa: PLC0415
-        from study.tables import document  # noqa: PLC0415
 
         print(markdown(document(summarise(_complete(tracker, name, options.profile)))), end="")
     else:
@@ -159,9 +160,9 @@ def main(args: Sequence[str]) -> int:
 
 
 def side_by_side(first: str, second: str, tracking: str, figure: Path | None = None) -> str:
-    """Two sweeps' comparison as Markdown, each named by a path or as NAME[:PROFILE][@URI]; `figure` is drawn first.
+    """Return two sweeps' comparison as Markdown, each named by a path or as NAME[:PROFILE][@URI].
 
-    Raises BadInputError for what cannot be read, drawn or written.
+    Both are drawn into `figure` first, where there is one. Raises BadInputError for what cannot be read or written.
     """
     from study.comparison import compare  # noqa: PLC0415
     from study.markdown import markdown  # noqa: PLC0415

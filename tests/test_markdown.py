@@ -9,9 +9,9 @@ from simulated import DATASIZE_GRID, HEADS_GRID, World, simulate
 from study.config import Grid, StudySettings
 from study.markdown import markdown
 from study.report import build_report
+from study.report_text import document
 from study.rounding import between, epochs, fixed, percent, points
 from study.summary import summarise
-from study.tables import document
 
 
 @pytest.fixture(scope="module")
