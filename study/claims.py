@@ -12,14 +12,14 @@ import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import pandas as pd
 from statsmodels.stats.multitest import multipletests
 
 from study import stats
-from study.config import HEAD_SETS, Grid, Rules
+from study.config import HEAD_SETS, FromJson, Grid, Number, Rules
 from study.result import CellResult, SweepRecord
 from study.stats import ACCURACY, STEERING, Estimate, Panel, Point
 
@@ -27,6 +27,7 @@ State = Literal["holds", "fails", "open"]
 Outcome = Literal["reproduced", "not reproduced", "inconclusive", "not tested"]
 OUTCOMES: tuple[Outcome, ...] = ("reproduced", "not reproduced", "inconclusive", "not tested")
 Unit = Literal["points", "loss", "epochs", "ratio"]
+Interval = Annotated[Estimate, FromJson]  # the same value, that pydantic can read back from a report.json
 
 MINUS = "\N{MINUS SIGN}"
 REACH = {1.0: 0.2, 0.25: 0.4, 0.0625: 0.6}  # fraction -> share of the epochs that the text names (Sec. V-A, V-B)
@@ -38,11 +39,11 @@ class Finding:
 
     what: str
     unit: Unit
-    estimate: Estimate
-    decides: tuple[float, float]
+    estimate: Interval
+    decides: tuple[Number, Number]
     needs: str
     state: State
-    p: float = math.nan
+    p: Number = math.nan
 
 
 @dataclass(frozen=True)
@@ -67,17 +68,18 @@ class Contrast:
     `simultaneous`: t interval for all planned contrasts of the metric together; `episodes`: interval over test drives.
     """
 
+    name: str
     metric: str
     first: Point
     second: Point
-    difference: Estimate
-    simultaneous: tuple[float, float]
-    p: float
-    p_holm: float
-    improvement: float
-    detectable: float
-    hierarchical: Estimate | None
-    episodes: Estimate | None
+    difference: Interval
+    simultaneous: tuple[Number, Number]
+    p: Number
+    p_holm: Number
+    improvement: Number
+    detectable: Number
+    hierarchical: Interval | None
+    episodes: Interval | None
 
 
 def label(point: Point, grid: Grid) -> str:
@@ -125,6 +127,7 @@ def compare(record: SweepRecord, metric: str, curves: Panel) -> list[Contrast]:
     adjusted = multipletests(family, method="holm")[1].tolist() if family else []
     return [
         Contrast(
+            difference_label(first, second, record.grid),
             metric,
             first,
             second,

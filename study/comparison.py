@@ -1,37 +1,41 @@
 """Two sweeps side by side: what they differ in, their scores with differences, orders of head sets, verdicts.
 
-Whatever made them: two commits, two simulators, two profiles, two stores. All of it comes from their report.json, which
-may be anybody's, so it is checked on reading.
+Whatever made them: two commits, two simulators, two profiles, two stores.
 """
 
 from __future__ import annotations
 
 import itertools
-import json
 import math
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
-from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 from study import stats
-from study.claims import MINUS
-from study.config import HEAD_SETS, BadInputError, Cell, Settings, validated
-from study.markdown import LOSS, NOTHING, SHARE_WORDS, between, code, fixed, found, plain, rows
-from study.stats import Estimate
-from study.summary import FORMAT_VERSION
+from study.claims import MINUS, Verdict
+from study.config import HEAD_SETS, Cell
+from study.document import Block, Heading, Inline, Paragraph, Picture, Row, bold, code, italic, lines, plain, table
+from study.report_model import Report, Score, Spread
+from study.rounding import LOSS, NOTHING, UNITS, between, epochs, fixed, interval, kinds, percent
+from study.stats import Estimate, Point
 
-Number = float | Literal["never"] | None
+SHARE_WORDS = (
+    "Ceiling: policies that are given the true state in the place of a latent. Share of gain: a score's part of the "
+    "way from the commonest class to there (acceleration only, since the state holds no route)."
+)
 
 
 class Measure(NamedTuple):
-    """A score: its name in a report.json, how tables print it, and the guess that makes its floor."""
+    """A score: its name in a report, how tables print it, and the guess that makes its floor."""
 
     name: str
     title: str
     digits: int
     factor: float
     guess: str
+
+    def show(self, value: float, *, sign: bool = False) -> str:
+        """Return a value as tables print it."""
+        return fixed(value, self.digits, self.factor, sign=sign)
 
 
 MEASURES = (
@@ -40,231 +44,46 @@ MEASURES = (
 )
 
 
-class Part(Settings, extra="ignore", allow_inf_nan=False):
-    """What a comparison needs of a part of a report.json."""
-
-
-class SweepPart(Part):
-    """Which sweep it is."""
-
-    name: str
-    title: str
-    simulator: str
-    profile: str
-    design: Literal["A", "B"]
-    encoder_seeds: int
-    policy_seeds: int
-    policy_epochs: int
-    baseline: str
-    planned: int
-    finished: int
-
-
-class SpreadPart(Part):
-    """A score: its mean, its interval's kind, and the value of each sampling unit by seed."""
-
-    mean: float
-    low: float | None
-    high: float | None
-    n: int
-    kind: str
-    units: dict[int, float]
-
-
-class ScorePart(Part):
-    """Scores of a head set and fraction; `share` of the possible gain, where the report has a ceiling."""
-
-    cell: str
-    heads: str
-    fraction: float
-    accuracy: SpreadPart
-    steering: SpreadPart
-    share: float | None = None
-
-
-class EstimatePart(Part):
-    """A number with its interval."""
-
-    value: Number
-    low: Number
-    high: Number
-    n: int
-
-
-class DifferencePart(Part):
-    """A difference between scores, with its interval."""
-
-    value: float
-    low: float | None
-    high: float | None
-    kind: str
-
-    def turned(self) -> DifferencePart:
-        """The other way round."""
-        low, high = (None if end is None else -end for end in (self.high, self.low))
-        return self.model_copy(update={"value": -self.value, "low": low, "high": high})
-
-
-class ContrastPart(Part):
-    """A difference between two cells of one sweep."""
-
-    metric: str
-    first: tuple[str, float]
-    second: tuple[str, float]
-    difference: DifferencePart
-    simultaneous: tuple[Number, Number]
-
-
-class ConvergencePart(Part):
-    """How fast a cell learns."""
-
-    heads: str
-    fraction: float
-    mean_curve: EstimatePart
-    share: float
-    area: float
-
-
-class FindingPart(Part):
-    """A number that a verdict rests on."""
-
-    what: str
-    unit: Literal["points", "loss", "epochs", "ratio"]
-    estimate: EstimatePart
-    state: str
-
-
-class ClaimPart(Part):
-    """A verdict."""
-
-    claim: str
-    outcome: str
-    reason: str
-    findings: tuple[FindingPart, ...]
-
-
-class SettingPart(Part):
-    """A setting with its value as text."""
-
-    group: str
-    name: str
-    value: str
-
-
-class DataPart(Part):
-    """The frames."""
-
-    key: str | None
-    sets: dict[str, dict[str, Any]]
-
-
-class ProvenancePart(Part):
-    """Where the numbers come from."""
-
-    commit: str | None
-    dirty: bool | None
-    lock: str | None
-    python: str | None
-    platform: str | None
-    cpu: str | None
-    packages: dict[str, str]
-    keys: dict[str, str]
-
-
-class Report(Part):
-    """What a comparison needs of a report.json."""
-
-    sweep: SweepPart
-    floor: dict[str, Number]
-    ceiling: SpreadPart | None = None
-    scores: tuple[ScorePart, ...]
-    comparisons: tuple[ContrastPart, ...]
-    convergence: tuple[ConvergencePart, ...]
-    claims: tuple[ClaimPart, ...]
-    rules: dict[str, float]
-    settings: tuple[SettingPart, ...]
-    data: DataPart
-    provenance: ProvenancePart
-
-    @property
-    def points(self) -> list[stats.Point]:
-        """Head sets and fractions that have a score."""
-        return [(row.heads, row.fraction) for row in self.scores]
-
-    def above_baseline(self, point: stats.Point) -> DifferencePart | None:
-        """The difference in accuracy of a head set to the baseline at the same fraction."""
-        base = (self.sweep.baseline, point[1])
-        for row in self.comparisons:
-            if row.metric == stats.ACCURACY and point != base and {row.first, row.second} == {point, base}:
-                return row.difference if row.first == point else row.difference.turned()
-        return None
-
-
-def checked(content: object, source: str) -> Report:
-    """The report in a report.json's content. Raises BadInputError naming the source and what is wrong."""
-    if not isinstance(content, dict) or "format_version" not in content:
-        raise BadInputError(f"{source} is no report of this program (no format_version); give one that it wrote")
-    if content["format_version"] != FORMAT_VERSION:
-        raise BadInputError(
-            f"{source} has report format {content['format_version']}, this program reads {FORMAT_VERSION}; "
-            "write it again with: python -m study.report NAME"
-        )
-    return validated(Report, content, f"{source} is no whole report, write it again with python -m study.report NAME")
-
-
-def read_report(path: Path) -> Report:
-    """The report in a report.json, or in the folder that holds one. Raises BadInputError when it is none."""
-    file = path / "report.json" if path.is_dir() else path
-    try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise BadInputError(f"cannot read {file}: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
-        raise BadInputError(f"{file} is no JSON: {error}; write it again with python -m study.report NAME") from error
-    return checked(content, str(file))
-
-
-# --- the text -------------------------------------------------------------------------------------------------------
-
-
-def compare(first: Report, second: Report, names: tuple[str, str], picture: str = "") -> str:
-    """Two reports side by side as Markdown; `names` say where each comes from, `picture` is shown with the scores."""
-    parts = [
-        f"## {plain(first.sweep.title)}: two sweeps side by side",
-        f"First: {code(names[0])}. Second: {code(names[1])}. Differences are second {MINUS} first.",
-        "### What differs",
-        _differing(first, second),
-        "### Final scores",
-        picture,
+def compare(first: Report, second: Report, names: tuple[str, str], picture: Picture | None = None) -> list[Block]:
+    """Return the document of two reports; `names` say where each comes from, `picture` is shown with the scores."""
+    sources = f"First: {code(names[0])}. Second: {code(names[1])}. Differences are second {MINUS} first."
+    return [
+        Heading(1, f"{plain(first.sweep.title)}: two sweeps side by side"),
+        Paragraph(sources),
+        Heading(2, "What differs"),
+        *_differing(first, second),
+        Heading(2, "Final scores"),
+        *([picture] if picture else []),
         *_scores(first, second),
-        "### Order of head sets by accuracy",
-        _orders(first, second),
-        _convergence(first, second),
-        "### Verdicts",
-        _verdicts(first, second),
+        Heading(2, "Order of head sets by accuracy"),
+        *_orders(first, second),
+        *_convergence(first, second),
+        Heading(2, "Verdicts"),
+        *_verdicts(first, second),
     ]
-    return "\n\n".join(part for part in parts if part) + "\n"
 
 
-def _differing(first: Report, second: Report) -> str:
-    """What differs in sweep, data, provenance, rules and settings; what does not is named in a line."""
+def _differing(first: Report, second: Report) -> Iterator[Block]:
+    """Yield what differs in sweep, data, provenance, rules and settings; what does not is named in a line."""
     sides = [dict(_facts(report)) for report in (first, second)]
     names = list(dict.fromkeys([*sides[0], *sides[1]]))
     other = [name for name in names if sides[0].get(name) != sides[1].get(name)]
-    body = [[plain(name), *(code(side[name]) if name in side else NOTHING for side in sides)] for name in other]
+    rows = [(name, *(code(side[name]) if name in side else NOTHING for side in sides)) for name in other]
+    yield from table(("", "first", "second"), rows, left=3)
     groups = {name: name.partition(" ")[0] for name in names}
     same = [group for group in dict.fromkeys(groups.values()) if all(groups[name] != group for name in other)]
-    told = f"Nothing differs in: {', '.join(same)}." if same else ""
-    return "\n\n".join(part for part in (rows(["", "first", "second"], body, left=3), told) if part)
+    if same:
+        yield Paragraph(f"Nothing differs in: {', '.join(same)}.")
 
 
 def _facts(report: Report) -> Iterator[tuple[str, str]]:
-    """Name and value of everything that two sweeps may differ in; a name's first word is its group."""
-    for name, value in report.sweep.model_dump(exclude={"title", "planned", "finished"}).items():
-        yield f"sweep {name}", str(value)
+    """Yield name and value of everything that two sweeps may differ in; a name's first word is its group."""
+    own, sweep = report.provenance, report.sweep
+    shown = ("name", "simulator", "profile", "design", "encoder_seeds", "policy_seeds", "policy_epochs", "baseline")
+    for name in shown:
+        yield f"sweep {name}", str(getattr(sweep, name))
     yield "sweep cells", ", ".join(row.cell for row in report.scores)
-    yield "sweep finished", f"{report.sweep.finished} of {report.sweep.planned}"
-    own = report.provenance
+    yield "sweep finished", f"{sweep.finished} of {sweep.planned}"
     yield "commit", f"{own.commit or 'unknown'}{' with uncommitted changes' * bool(own.dirty)}"
     yield "data key", str(report.data.key)
     for name, content in report.data.sets.items():
@@ -287,76 +106,63 @@ def _facts(report: Report) -> Iterator[tuple[str, str]]:
 # --- scores ---------------------------------------------------------------------------------------------------------
 
 
-def labels(first: Report, second: Report) -> dict[stats.Point, str]:
-    """Head sets and fractions that either has a score of, most data first, with names that tell them apart."""
+def labels(first: Report, second: Report) -> dict[Point, str]:
+    """Return the head sets and fractions that either has scores of, most data first, with names to tell them apart."""
     order = {heads: place for place, heads in enumerate(HEAD_SETS)}
-    points = sorted(
+    cells = sorted(
         {*first.points, *second.points}, key=lambda point: (-point[1], order.get(point[0], len(order)), point[0])
     )
-    several = len({fraction for _, fraction in points}) > 1
-    return {(heads, part): f"{heads} at {100 * part:g} %" if several else heads for heads, part in points}
+    several = len({fraction for _, fraction in cells}) > 1
+    return {(heads, part): f"{heads} at {100 * part:g} %" if several else heads for heads, part in cells}
 
 
-def _scores(first: Report, second: Report) -> Iterator[str]:
-    names, ceilings = labels(first, second), (first.ceiling, second.ceiling)
-    both = [point for point in names if point in first.points and point in second.points]
-    kinds: list[str] = []
-    tables = [_measured(first, second, both, measure, kinds) for measure in MEASURES]
+def _scores(first: Report, second: Report) -> Iterator[Block]:
+    names, sides = labels(first, second), (first, second)
+    scores = [{(row.heads, row.fraction): row for row in report.scores} for report in sides]
+    both = {point: (scores[0][point], scores[1][point]) for point in names if all(point in side for side in scores)}
     if not both:
-        yield "No head set and fraction is finished in both."
-    if kinds:
-        yield f"{_about(first, second, kinds)} {SHARE_WORDS}" if all(ceilings) else _about(first, second, kinds)
-    told = [f"{plain(names[point])} ({words})" for point in both if (words := _shared(first, second, point))]
-    if told:
-        yield f"Cells of the same key in both: {', '.join(told)}."
-    yield from tables
+        yield Paragraph("No head set and fraction is finished in both.")
+    pairs: dict[str, list[tuple[str, Spread | None, Spread | None]]] = {
+        "accuracy": [(names[point], one.accuracy, other.accuracy) for point, (one, other) in both.items()],
+        "steering": [(names[point], one.steering, other.steering) for point, (one, other) in both.items()],
+    }
+    if first.ceiling or second.ceiling:
+        pairs["accuracy"].append((italic("ceiling (true state)"), first.ceiling, second.ceiling))
+    changes = [difference(one, other) for own in pairs.values() for _, one, other in own if one and other]
+    shares = first.ceiling and second.ceiling
+    if changes:
+        yield Paragraph(" ".join([_about(first, second, changes), *([SHARE_WORDS] if shares else [])]))
+    same = [f"{plain(names[point])} ({words})" for point, own in both.items() if (words := _shared(sides, *own))]
+    if same:
+        yield Paragraph(f"Cells of the same key in both: {', '.join(same)}.")
+    for measure in MEASURES:
+        header = [measure.title, "first (n)", "second (n)", "difference", "95 %"]
+        rows = [[name, *_beside(measure, one, other)] for name, one, other in pairs[measure.name]]
+        floors = [measure.show(report.floor.get(measure.name, math.nan)) for report in sides]
+        rows.append([italic(f"floor ({measure.guess})"), *floors, NOTHING, NOTHING])
+        if shares and measure.name == "accuracy":
+            header += ["share of gain, first [%]", "share of gain, second [%]"]
+            gains = [*((one.share, other.share) for one, other in both.values()), (1.0, 1.0), (0.0, 0.0)]
+            rows = [[*row, *(percent(share, 0) for share in gain)] for row, gain in zip(rows, gains, strict=True)]
+        yield from table(header, rows)
     for name, one, other in (("first", first, second), ("second", second, first)):
         alone = [plain(names[point]) for point in names if point in one.points and point not in other.points]
         if alone:
-            yield f"Only in the {name}: {', '.join(alone)}."
+            yield Paragraph(f"Only in the {name}: {', '.join(alone)}.")
 
 
-def _measured(first: Report, second: Report, both: Sequence[stats.Point], measure: Measure, kinds: list[str]) -> str:
-    """The table of a measure, with its ceiling and floor; adds the kinds of its intervals to `kinds`."""
-    sides, names, show = (
-        (first, second),
-        labels(first, second),
-        partial(fixed, digits=measure.digits, factor=measure.factor),
-    )
-    ceilings = [report.ceiling for report in sides if measure.name == "accuracy"]
-    body, shares = [], []
-    for point in both:
-        scores = [_score(report, point) for report in sides]
-        shares.append([score.share for score in scores])
-        body.append([plain(names[point]), *_beside([getattr(score, measure.name) for score in scores], show, kinds)])
-    if any(ceilings):
-        shares.append([1.0, 1.0])
-        body.append(["*ceiling (true state)*", *_beside(ceilings, show, kinds)])
-    floors = [report.floor.get(measure.name) for report in sides]
-    if floors != [None, None]:
-        shares.append([0.0, 0.0])
-        body.append([f"*floor ({measure.guess})*", *map(show, floors), NOTHING, NOTHING])
-    header = [measure.title, "first (n)", "second (n)", "difference", "95 %"]
-    if ceilings and all(ceilings):
-        header += ["share of gain, first [%]", "share of gain, second [%]"]
-        body = [[*row, *(fixed(share, 0, 100) for share in own)] for row, own in zip(body, shares, strict=True)]
-    return rows(header, body)
-
-
-def _beside(sides: Sequence[SpreadPart | None], show: Callable[..., str], kinds: list[str]) -> list[str]:
-    """Two scores with n, and their difference with its interval, whose kind is added to `kinds`."""
-    cells = [f"{show(side.mean)} ({side.n})" if side else NOTHING for side in sides]
-    first, second = sides
+def _beside(measure: Measure, first: Spread | None, second: Spread | None) -> list[str]:
+    """Return two scores with n, and their difference with its interval."""
+    cells = [f"{measure.show(side.mean)} ({side.n})" if side else NOTHING for side in (first, second)]
     if not first or not second:
         return [*cells, NOTHING, NOTHING]
-    made = difference(first, second)
-    kinds.append(made.kind)
-    low, high = (None if math.isnan(end) else end for end in (made.low, made.high))
-    return [*cells, show(made.value, sign=True), between(show(low, sign=True), show(high, sign=True))]
+    change = difference(first, second)
+    low, high = (measure.show(end, sign=True) for end in (change.low, change.high))
+    return [*cells, measure.show(change.value, sign=True), low if low == NOTHING else f"{low} to {high}"]
 
 
-def difference(first: SpreadPart, second: SpreadPart) -> Estimate:
-    """Second minus first, with a 95 % interval over their sampling units.
+def difference(first: Spread, second: Spread) -> Estimate:
+    """Return second minus first, with a 95 % interval over their sampling units.
 
     Paired by seed where both have the same seeds: seed k starts from the same initial weights whatever the data, which
     binds steering losses together (r = 0.8 between cells of the laptop profile) and accuracies not (r = 0.0). Pairs are
@@ -367,122 +173,106 @@ def difference(first: SpreadPart, second: SpreadPart) -> Estimate:
     return stats.welch(list(second.units.values()), list(first.units.values()))
 
 
-def _about(first: Report, second: Report, kinds: Sequence[str]) -> str:
-    """What the intervals are over."""
+def _about(first: Report, second: Report, changes: Sequence[Estimate]) -> str:
+    """Return what the intervals are over."""
     text = (
         "Mean of the last five epochs on test drives; n are policies on one encoder, or encoders where there are "
-        f"several. Interval: {'; '.join(dict.fromkeys(kinds))}."
+        f"several. Interval: {kinds(changes)}."
     )
     if "A" in (first.sweep.design, second.sweep.design):
         allowance = max(report.rules.get("encoder_allowance", 0.0) for report in (first, second))
         text += (
             " With one encoder a cell it says nothing about other encoders, which by the sweep files' rules may differ "
-            f"by {fixed(allowance, 1, 100)} points through their seeds alone."
+            f"by {percent(allowance)} points through their seeds alone."
         )
     return text
 
 
-def _score(report: Report, point: stats.Point) -> ScorePart:
-    return next(row for row in report.scores if (row.heads, row.fraction) == point)
-
-
-def _shared(first: Report, second: Report, point: stats.Point) -> str:
-    """Whether a point's cells have the same keys in both, and whether it is one result or two runs."""
-    mine, theirs = (_keys(report, point) for report in (first, second))
+def _shared(sides: tuple[Report, Report], first: Score, second: Score) -> str:
+    """Return whether a cell has the same keys in both, and whether it is one result or two runs."""
+    mine, theirs = (_keys(report, first) for report in sides)
     if not mine or mine != theirs:
         return ""
-    equal = all(
-        getattr(_score(first, point), metric) == getattr(_score(second, point), metric)
-        for metric in ("accuracy", "steering")
-    )
+    equal = first.accuracy == second.accuracy and first.steering == second.steering
     return "the same result" if equal else "same settings, run twice"
 
 
-def _keys(report: Report, point: stats.Point) -> list[str]:
-    cells = [Cell(heads=point[0], fraction=point[1], encoder_seed=k).label for k in range(report.sweep.encoder_seeds)]
+def _keys(report: Report, score: Score) -> list[str]:
+    seeds = range(report.sweep.encoder_seeds)
+    cells = [Cell(heads=score.heads, fraction=score.fraction, encoder_seed=seed).label for seed in seeds]
     return [report.provenance.keys[label] for label in cells if label in report.provenance.keys]
 
 
 # --- orders, convergence, verdicts ----------------------------------------------------------------------------------
 
 
-def _orders(first: Report, second: Report) -> str:
+def _orders(first: Report, second: Report) -> Iterator[Block]:
     fractions = sorted({fraction for report in (first, second) for _, fraction in report.points}, reverse=True)
-    body = []
+    rows: list[Row] = []
     for fraction in fractions:
-        one, other = (_order(report, fraction) for report in (first, second))
-        means = [[name for name, _ in order] for order in (one, other)]
-        common = [[name for name in names if all(name in side for side in means)] for names in means]
-        verdict = NOTHING if len(common[0]) < 2 else "the same" if common[0] == common[1] else "**another**"
-        body.append([f"{100 * fraction:g} %", *(_chain(order) for order in (one, other)), verdict])
-    table = rows(["fraction", "first", "second", "order"], body, left=4)
-    return table and (
-        "`>`: above the next by the simultaneous interval of their paired difference; `~`: not so. Order: of the head "
-        f"sets that both have.\n\n{table}"
-    )
+        chains, orders = [], []
+        for report in (first, second):
+            at = sorted((row for row in report.scores if row.fraction == fraction), key=lambda row: -row.accuracy.mean)
+            signs = [_sign(report, (up.heads, fraction), (down.heads, fraction)) for up, down in itertools.pairwise(at)]
+            orders.append([row.heads for row in at])
+            chain = itertools.zip_longest(map(plain, orders[-1]), signs, fillvalue="")
+            chains.append(Inline(" ".join(f"{name} {sign}" for name, sign in chain).strip()) or NOTHING)
+        one, other = ([name for name in order if all(name in side for side in orders)] for order in orders)
+        verdict = NOTHING if len(one) < 2 else "the same" if one == other else bold("another")
+        rows.append((f"{100 * fraction:g} %", *chains, verdict))
+    if rows:
+        yield Paragraph(
+            "`>`: above the next by the simultaneous interval of their paired difference; `~`: not so. Order: of the "
+            "head sets that both have."
+        )
+    yield from table(("fraction", "first", "second", "order"), rows, left=4)
 
 
-def _order(report: Report, fraction: float) -> list[tuple[str, str]]:
-    """Head sets from the best down, each with the sign towards the next."""
-    at = sorted((row for row in report.scores if row.fraction == fraction), key=lambda row: -row.accuracy.mean)
-    signs = [_sign(report, (up.heads, fraction), (down.heads, fraction)) for up, down in itertools.pairwise(at)]
-    return list(itertools.zip_longest((row.heads for row in at), signs, fillvalue=""))
-
-
-def _sign(report: Report, up: stats.Point, down: stats.Point) -> str:
-    for contrast in report.comparisons:
-        if contrast.metric == stats.ACCURACY and {contrast.first, contrast.second} == {up, down}:
+def _sign(report: Report, up: Point, down: Point) -> str:
+    for contrast in report.accuracy_contrasts:
+        if {contrast.first, contrast.second} == {up, down}:
             low, high = contrast.simultaneous
-            if isinstance(low, float) and isinstance(high, float):
-                return ">" if (low > 0 if contrast.first == up else high < 0) else "~"
+            return ">" if (low > 0 if contrast.first == up else high < 0) else "~"
     return "~"
 
 
-def _chain(order: Sequence[tuple[str, str]]) -> str:
-    return " ".join(f"{plain(name)} {sign}".strip() for name, sign in order) or NOTHING
+def _convergence(first: Report, second: Report) -> Iterator[Block]:
+    names = labels(first, second)
+    others = {(row.heads, row.fraction): row for row in second.convergence}
+    rows: list[Row] = []
+    for one in first.convergence:
+        point = (one.heads, one.fraction)
+        if point in others:
+            both = (one, others[point])
+            curves = (f"{epochs(row.mean_curve.value)} ({interval(row.mean_curve, epochs)})" for row in both)
+            shares, areas = (percent(row.share, 0) for row in both), (percent(row.area, 2) for row in both)
+            rows.append((names[point], *curves, *shares, *areas))
+    if rows:
+        yield Heading(2, "Convergence")
+        yield Paragraph(
+            "Epochs until the mean curve reaches the baseline's final accuracy of its own sweep (95 %), share of the "
+            "seeds that do [%], mean accuracy over all epochs [%]."
+        )
+    header = (f"{name}, {side}" for name in ("epochs", "share", "area") for side in ("first", "second"))
+    yield from table(("Cell", *header), rows)
 
 
-def _convergence(first: Report, second: Report) -> str:
-    sides = [{(row.heads, row.fraction): row for row in report.convergence} for report in (first, second)]
-    body, names = [], labels(first, second)
-    for point in sides[0]:
-        if point in sides[1]:
-            both = [side[point] for side in sides]
-            body.append(
-                [
-                    plain(names[point]),
-                    *(
-                        f"{fixed(row.mean_curve.value, 0)} "
-                        f"({between(fixed(row.mean_curve.low, 0), fixed(row.mean_curve.high, 0))})"
-                        for row in both
-                    ),
-                    *(fixed(row.share, 0, 100) for row in both),
-                    *(fixed(row.area, 2, 100) for row in both),
-                ]
-            )
-    header = ["Cell", "epochs, first", "epochs, second", "share, first", "share, second", "area, first", "area, second"]
-    table = rows(header, body)
-    return table and (
-        "### Convergence\n\nEpochs until the mean curve reaches the baseline's final accuracy of its own sweep (95 %), "
-        f"share of the seeds that do [%], mean accuracy over all epochs [%].\n\n{table}"
-    )
-
-
-def _verdicts(first: Report, second: Report) -> str:
+def _verdicts(first: Report, second: Report) -> Iterator[Block]:
     sides = [{claim.claim: claim for claim in report.claims} for report in (first, second)]
-    body, changed = [], []
-    for name in dict.fromkeys([*sides[0], *sides[1]]):
-        both = [side.get(name) for side in sides]
-        outcomes = [claim.outcome if claim else None for claim in both]
-        if None not in outcomes and outcomes[0] != outcomes[1]:
-            changed.append(name)
-        body.append([f"**{plain(name)}**" if name in changed else plain(name), *(_verdict(claim) for claim in both)])
-    told = f"Verdicts that changed: {', '.join(map(plain, changed)) or 'none'}."
-    return f"{told}\n\n{rows(['Claim', 'first', 'second'], body, left=3)}" if body else ""
+    both = {name: [side.get(name) for side in sides] for name in dict.fromkeys([*sides[0], *sides[1]])}
+    changed = [name for name, (one, other) in both.items() if one and other and one.outcome != other.outcome]
+    if both:
+        yield Paragraph(f"Verdicts that changed: {', '.join(map(plain, changed)) or 'none'}.")
+    rows = [(bold(name) if name in changed else name, *map(_verdict, own)) for name, own in both.items()]
+    yield from table(("Claim", "first", "second"), rows, left=3)
 
 
-def _verdict(claim: ClaimPart | None) -> str:
+def _verdict(claim: Verdict | None) -> str:
     if claim is None:
         return NOTHING
-    findings = [found(item.model_dump()) for item in claim.findings] or [plain(claim.reason)]
-    return "<br>".join([f"**{plain(claim.outcome)}**", *findings])
+    findings = []
+    for finding in claim.findings:
+        unit, own = UNITS[finding.unit], finding.estimate
+        value, ends = unit.phrase.format(unit.show(own.value)), between(own.low, own.high, unit.show)
+        findings.append(f"{finding.what}: {value} ({ends}, n = {own.n}), {finding.state}")
+    return lines([bold(claim.outcome), *(findings or [claim.reason])])

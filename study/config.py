@@ -9,12 +9,13 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
+import math
 import re
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 # --- the paper's networks (Sec. IV-B, IV-C) -------------------------------------------------------------------------
 
@@ -68,6 +69,15 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
+def _from_json(value: Any) -> Any:
+    """Return a number of a JSON, or those of a mapping, as floats: null is NaN, "never" is infinity."""
+    if isinstance(value, dict):
+        return {name: _from_json(item) for name, item in value.items()}
+    return math.nan if value is None else math.inf if value == "never" else value
+
+
+FromJson = BeforeValidator(_from_json)
+Number = Annotated[float, FromJson]
 Model = TypeVar("Model", bound=BaseModel)
 Share = Annotated[float, Field(ge=0, le=1)]
 Positive = Annotated[float, Field(gt=0)]

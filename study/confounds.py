@@ -10,9 +10,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 from study import claims, stats
+from study.claims import Interval
 from study.config import StudySettings
 from study.result import SweepRecord
-from study.stats import Estimate, Point
+from study.stats import Point
 
 
 @dataclass(frozen=True)
@@ -75,11 +76,12 @@ class Contrast:
     `state`: "moved" where the change's interval, widened by the allowance for other encoders, excludes 0.
     """
 
+    name: str
     first: Point
     second: Point
-    here: Estimate
-    there: Estimate
-    change: Estimate
+    here: Interval
+    there: Interval
+    change: Interval
     state: Movement
 
 
@@ -124,6 +126,7 @@ def contrasts(record: SweepRecord, other: SweepRecord, confound: Confound) -> li
         moved = change.low - more > 0 or change.high + more < 0
         rows.append(
             Contrast(
+                claims.difference_label(first, second, record.grid),
                 first,
                 second,
                 stats.mean_interval(here),

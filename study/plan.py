@@ -31,7 +31,6 @@ from study.job import CellJob
 from study.stages import Cost, Work, data_cost
 
 if TYPE_CHECKING:
-    from study.result import CellJob
     from study.tracking import Tracker
 
 
@@ -165,8 +164,6 @@ def look_up(tracking: str) -> Tracker | None:
 
 def cell_jobs(plan: Plan, device: str, threads: int) -> dict[str, CellJob]:
     """Return what training each cell needs to know, by key."""
-    from study.result import CellJob  # noqa: PLC0415 - loads pandas, which planning needs not
-
     seeds, folders = plan.grid.policy_seeds, (plan.frames, plan.drives, DATA)
     return {
         key: CellJob(cell, key, plan.settings, seeds, *folders, device, threads, plan.imported)

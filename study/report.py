@@ -1,4 +1,4 @@
-"""The report of a sweep: every number in one JSON, the figures, and the PDF that Typst sets from both.
+"""The report of a sweep: every number in one JSON, the figures, and the document that Typst sets from both.
 
 python -m study.report heads
 python -m study.report datasize --profile smoke --tracking http://127.0.0.1:5000
@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,7 +19,8 @@ from study.command import Parser, add_tracking_option, run
 from study.config import SWEEPS, BadInputError, masked, named_files
 
 if TYPE_CHECKING:  # the command answers --help without the libraries that only a report needs
-    from study.comparison import Report
+    from study.document import Block, Picture
+    from study.report_model import Report
     from study.result import SweepRecord
     from study.tracking import Tracker
 
@@ -34,39 +35,40 @@ def build_report(record: SweepRecord, folder: Path = REPORTS) -> Path:
     """
     from study.drawings import draw  # noqa: PLC0415
     from study.figures import save  # noqa: PLC0415
-    from study.summary import numbers  # noqa: PLC0415
+    from study.report_model import FigureText  # noqa: PLC0415
+    from study.report_text import document  # noqa: PLC0415
+    from study.summary import summarise  # noqa: PLC0415
 
-    made, own = numbers(record), folder / record.grid.name
-    drawings = draw(record, made)
-    made["figures"] = [
-        {"name": item.name, "place": item.place, "caption": item.caption, "alt": item.alt} for item in drawings
-    ]
-    pictures = {}
-    for item in drawings:
-        vector, raster = save(item.figure, own / "figures", item.name)
-        pictures[f"figures/{vector.name}"] = vector.read_bytes()
-        pictures[f"figures/{raster.name}"] = b""
+    report, own = summarise(record), folder / record.grid.name
+    drawings = draw(record, report)
+    figures = tuple(FigureText.model_validate(drawing, from_attributes=True) for drawing in drawings)
+    report = report.model_copy(update={"figures": figures})
+    files = [file for drawing in drawings for file in save(drawing.figure, own / "figures", drawing.name)]
     for left in (own / "figures").glob("*"):
-        if f"figures/{left.name}" not in pictures:  # of an earlier report with other cells
+        if left not in files:  # of an earlier report with other cells
             left.unlink()
-    text = json.dumps(made, indent=1, ensure_ascii=False, allow_nan=False).encode()
-    _write(own / "report.json", text)
+    _write(own / "report.json", report.json())
     draft = own / ".curves.parquet"
     record.table(ceiling=True).to_parquet(draft, index=False)
     draft.replace(own / "curves.parquet")
+    pictures = {f"figures/{file.name}": file.read_bytes() for file in files if file.suffix == ".svg"}
     pdf = folder / f"{record.grid.name}.pdf"
-    _write(pdf, typeset(text, {name: content for name, content in pictures.items() if content}))
+    sweep = report.sweep
+    title, footer = f"{sweep.title} ({sweep.name}, {sweep.profile})", f"{sweep.name} ({sweep.profile})"
+    _write(pdf, typeset(title, footer, document(report), pictures))
     return pdf
 
 
-def typeset(numbers: bytes, pictures: dict[str, bytes]) -> bytes:
-    """The PDF of a report.json and its figures, with the fonts that Typst brings along."""
+def typeset(title: str, footer: str, blocks: Sequence[Block], pictures: dict[str, bytes]) -> bytes:
+    """Return the PDF of a document and its pictures, with the fonts that Typst brings along."""
     import typst  # noqa: PLC0415
 
-    files = {"main.typ": TEMPLATE.read_bytes(), "report.json": numbers, **pictures}
+    listed = [{"kind": type(block).__name__, **asdict(block)} for block in blocks]
+    content = json.dumps({"title": title, "footer": footer, "blocks": listed}).encode()
+    files = {"main.typ": TEMPLATE.read_bytes(), "document.json": content, **pictures}
     # Its type stub does not know of files by name, which its documentation has.
-    content: bytes = typst.compile(files, format="pdf", ignore_system_fonts=True)  # type: ignore[call-overload]
-    return content
+    pdf: bytes = typst.compile(files, format="pdf", ignore_system_fonts=True)  # type: ignore[call-overload]
+    return pdf
 
 
 def _write(path: Path, content: bytes) -> None:
@@ -81,27 +83,28 @@ def _write(path: Path, content: bytes) -> None:
 
 def publish(tracker: Tracker, name: str, profile: str | None, folder: Path) -> Path:
     """Build the report from the tracker alone, and add it to the sweep's run. Returns the PDF's path."""
-    pdf = build_report(_whole(tracker, name, profile), folder)
+    pdf = build_report(_complete(tracker, name, profile), folder)
     own, sweep_run = folder / name, tracker.sweep_run(name, profile)
     tracker.log_files(sweep_run, [pdf, own / "report.json", own / "curves.parquet"], "report")
     tracker.log_files(sweep_run, sorted((own / "figures").iterdir()), "figures")
     return pdf
 
 
-def _whole(tracker: Tracker, name: str, profile: str | None) -> SweepRecord:
-    """A sweep, and those that vary one of its confounds."""
+def _complete(tracker: Tracker, name: str, profile: str | None) -> SweepRecord:
+    """Return a sweep with those that vary one of its confounds."""
     record = tracker.read_sweep(name, profile)
     return replace(record, variants=tracker.read_variants(record))
 
 
 def parser() -> Parser:
-    """The command line."""
+    """Return the command line."""
     made = Parser(
         prog="study.report",
         usage="python -m study.report SWEEP [--profile P] [--format {pdf,md}] [--tracking URI] [--out DIR]\n"
         "       python -m study.report compare A B [--figure FILE] [--tracking URI]",
         description="Write the report of a sweep from what MLflow holds: PDF, figures, numbers and the tidy table; or "
-        "its tables as Markdown on stdout; or set two sweeps side by side, as Markdown on stdout, with a picture.",
+        "the report without figures as Markdown on stdout; or set two sweeps side by side, as Markdown on stdout, with "
+        "a picture.",
         epilog="A and B: each a report.json, a folder that holds one, or NAME[:PROFILE][@URI] of a sweep in MLflow. "
         "Examples: python -m study.report heads --profile smoke; "
         "python -m study.report compare reports/reference/heads heads:laptop --figure both.svg > both.md",
@@ -146,26 +149,28 @@ def main(args: Sequence[str]) -> int:
 
     tracker = Tracker(options.tracking)
     if options.format == "md":
-        from study.markdown import written  # noqa: PLC0415
-        from study.summary import numbers  # noqa: PLC0415
+        from study.markdown import markdown  # noqa: PLC0415
+        from study.report_text import document  # noqa: PLC0415
+        from study.summary import summarise  # noqa: PLC0415
 
-        print(written(numbers(_whole(tracker, name, options.profile))), end="")
+        print(markdown(document(summarise(_complete(tracker, name, options.profile)))), end="")
     else:
         print(publish(tracker, name, options.profile, options.out or REPORTS))
     return 0
 
 
 def side_by_side(first: str, second: str, tracking: str, figure: Path | None = None) -> str:
-    """Two sweeps' comparison as Markdown, each named by a path or as NAME[:PROFILE][@URI]; `figure` is drawn first.
+    """Return two sweeps' comparison as Markdown, each named by a path or as NAME[:PROFILE][@URI].
 
-    Raises BadInputError for what cannot be read, drawn or written.
+    Both are drawn into `figure` first, where there is one. Raises BadInputError for what cannot be read or written.
     """
     from study.comparison import compare  # noqa: PLC0415
+    from study.markdown import markdown  # noqa: PLC0415
 
     if figure:
         _check_figure(figure)
     sides, names = (_report(first, tracking), _report(second, tracking)), (masked(first), masked(second))
-    return compare(*sides, names, _draw(figure, *sides, names) if figure else "")
+    return markdown(compare(*sides, names, _draw(figure, *sides, names) if figure else None))
 
 
 def _check_figure(file: Path) -> None:
@@ -182,33 +187,31 @@ def _check_figure(file: Path) -> None:
         raise BadInputError(f"--figure {file} is a folder; name a file in it")
 
 
-def _draw(file: Path, first: Report, second: Report, names: tuple[str, str]) -> str:
-    """Draw two sweeps into a file. Returns the Markdown that shows it."""
+def _draw(file: Path, first: Report, second: Report, names: tuple[str, str]) -> Picture:
+    """Draw two sweeps into a file. Returns the picture by its path from the working folder."""
+    from study.document import Picture, plain  # noqa: PLC0415
     from study.drawings import draw_sweeps  # noqa: PLC0415
     from study.figures import write  # noqa: PLC0415
-    from study.markdown import picture  # noqa: PLC0415
 
     drawing = draw_sweeps(first, second, names)
     try:
         write(drawing.figure, file)
     except OSError as error:
         raise BadInputError(f"cannot write {file}: {error.strerror}; name another file") from error
-    return picture(Path(os.path.relpath(file)).as_posix(), drawing.alt, drawing.caption)
+    return Picture(Path(os.path.relpath(file)).as_posix(), plain(drawing.caption), plain(drawing.alt))
 
 
 def _report(source: str, tracking: str) -> Report:
-    from study.comparison import checked, read_report  # noqa: PLC0415
+    from study.report_model import read_report  # noqa: PLC0415
 
     sweep, _, uri = source.partition("@")
     if Path(source).exists() or "/" in sweep or sweep.endswith(".json"):
         return read_report(Path(source))
-    from study.summary import numbers  # noqa: PLC0415
+    from study.summary import summarise  # noqa: PLC0415
     from study.tracking import Tracker  # noqa: PLC0415
 
     name, _, profile = sweep.partition(":")
-    # Through JSON, so that both sides have been the same way.
-    made = numbers(Tracker(uri or tracking).read_sweep(name, profile or None))
-    return checked(json.loads(json.dumps(made)), masked(source))
+    return summarise(Tracker(uri or tracking).read_sweep(name, profile or None))
 
 
 if __name__ == "__main__":

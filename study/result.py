@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -156,16 +157,21 @@ class SweepRecord:
         return self.results.get(key)
 
     def table(self, *, ceiling: bool = False) -> pd.DataFrame:
-        """The tidy table: one row per measured point, columns TABLE_COLUMNS, in the order of the plan.
+        """Return the tidy table: one row per measured point, columns TABLE_COLUMNS, in the order of the plan.
 
         The ceiling is no head set under study: it is in the table only when asked for.
         """
+        tidy = self._tidy
+        return tidy if ceiling else tidy[tidy["heads"] != CEILING].reset_index(drop=True)
+
+    @cached_property
+    def _tidy(self) -> pd.DataFrame:
         parts = [
             self.results[key].curves.assign(
                 sweep=self.grid.name, heads=cell.heads, fraction=cell.fraction, encoder_seed=cell.encoder_seed
             )
             for key, cell in self.planned.items()
-            if key in self.results and (ceiling or cell.heads != CEILING)
+            if key in self.results
         ]
         if not parts:
             return pd.DataFrame(columns=list(TABLE_COLUMNS))

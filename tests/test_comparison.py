@@ -4,9 +4,11 @@ import re
 import pytest
 
 from simulated import HEADS_GRID, World, simulate
-from study.comparison import checked, compare, difference, read_report
+from study.comparison import compare, difference
 from study.config import BadInputError, Grid
-from study.summary import numbers
+from study.markdown import markdown
+from study.report_model import checked, read_report
+from study.summary import summarise
 
 SMALL = Grid(name="small", title="Small | <b>study</b>", heads=("rec", "full"), policy_seeds=4, claims=("H4",))
 FAST = World(epochs=12)
@@ -14,7 +16,11 @@ FAST = World(epochs=12)
 
 def made(record):
     """The content of a report.json, having been through JSON."""
-    return json.loads(json.dumps(numbers(record)))
+    return json.loads(summarise(record).json())
+
+
+def compared(first, second, names):
+    return markdown(compare(first, second, names))
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +40,7 @@ def pair():
 
 @pytest.fixture(scope="module")
 def text(pair):
-    return compare(*pair, ("old", "new"))
+    return compared(*pair, ("old", "new"))
 
 
 def row(text, *starts):
@@ -74,14 +80,14 @@ def test_a_report_without_a_ceiling_or_of_a_time_before_it_is_compared_without_s
     old = {name: value for name, value in content.items() if name != "ceiling"}
     old["scores"] = [{name: value for name, value in score.items() if name != "share"} for score in old["scores"]]
     whole, before = checked(content, "new"), checked(old, "old")
-    text = compare(whole, before, ("new", "old"))
+    text = compared(whole, before, ("new", "old"))
     assert "share of gain" not in text
     assert row(text, "*ceiling (true state)*")[1:] == [f"{100 * whole.ceiling.mean:.2f} (4)", *["\N{EM DASH}"] * 3]
-    assert "ceiling" not in compare(before, before, ("old", "old"))
+    assert "ceiling" not in compared(before, before, ("old", "old"))
 
 
 def test_rows_have_as_many_cells_as_their_heads(pair, text, content):
-    for one in (text, compare(pair[0], checked(content, "part"), ("whole", "part"))):
+    for one in (text, compared(pair[0], checked(content, "part"), ("whole", "part"))):
         for block in re.findall(r"(?:^\|.*\n)+", one, flags=re.MULTILINE):
             assert len({len(re.findall(r"(?<!\\)\|", line)) for line in block.splitlines()}) == 1
 
@@ -115,7 +121,7 @@ def test_the_same_seeds_are_paired_and_others_are_two_samples(pair):
 
 
 def test_a_sweep_beside_itself_differs_in_nothing(pair):
-    text = compare(pair[0], pair[0], ("x", "x"))
+    text = compared(pair[0], pair[0], ("x", "x"))
     assert "rec (the same result), rec+pred (the same result)" in text
     assert row(text, "full")[3:5] == ["0.00", "0.00 to 0.00"]
     assert "Verdicts that changed: none" in text
@@ -124,14 +130,14 @@ def test_a_sweep_beside_itself_differs_in_nothing(pair):
 
 def test_cells_of_one_sweep_only_are_named(content):
     whole = checked(made(simulate(HEADS_GRID, FAST)), "whole")
-    text = compare(checked(content, "part"), whole, ("part", "whole"))
+    text = compared(checked(content, "part"), whole, ("part", "whole"))
     assert "Only in the second: rec+pred, rec+plan." in text
     assert row(text, "100 %")[3] == "the same"
 
 
 def test_cells_at_different_fractions_are_told_apart(content):
     half = checked(made(simulate(SMALL.model_copy(update={"fractions": (0.5,)}), FAST)), "half")
-    text = compare(checked(content, "all"), half, ("all", "half"))
+    text = compared(checked(content, "all"), half, ("all", "half"))
     assert "Only in the first: rec at 100 %, full at 100 %." in text
     assert "Only in the second: rec at 50 %, full at 50 %." in text
     assert row(text, "*ceiling (true state)*")[3] != "\N{EM DASH}"
@@ -140,18 +146,18 @@ def test_cells_at_different_fractions_are_told_apart(content):
 
 def test_nothing_in_common_is_said(content):
     grid = SMALL.model_copy(update={"heads": ("rec+plan",)})
-    text = compare(checked(content, "a"), checked(made(simulate(grid, FAST)), "b"), ("a", "b"))
+    text = compared(checked(content, "a"), checked(made(simulate(grid, FAST)), "b"), ("a", "b"))
     assert "No head set and fraction is finished in both" in text
     empty = simulate(SMALL, FAST, unfinished=[cell.label for cell in SMALL.cells()])
-    assert "No head set" in compare(checked(made(empty), "a"), checked(content, "b"), ("a", "b"))
+    assert "No head set" in compared(checked(made(empty), "a"), checked(content, "b"), ("a", "b"))
 
 
 def test_words_of_a_report_stay_words(content):
     content = content | {"claims": [content["claims"][0] | {"reason": "a | b\n<script>", "findings": []}]}
     one = checked(content, "a")
-    text = compare(one, one, ("a|b", "`c`"))
-    assert "Small \\| &lt;b>study&lt;/b>" in text
-    assert "a \\| b &lt;script>" in text
+    text = compared(one, one, ("a|b", "`c`"))
+    assert "Small \\| \\<b>study\\</b>" in text
+    assert "a \\| b \\<script>" in text
     assert "`a b`" in text
 
 

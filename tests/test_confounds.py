@@ -11,7 +11,7 @@ from study.config import StudySettings, load_grid
 from study.confounds import CONFOUNDS, concerned, contrasts, varied
 from study.plan import make_plan
 from study.report import build_report
-from study.summary import numbers
+from study.summary import summarise
 
 SPLIT = CONFOUNDS[0]
 FAST = World(epochs=8)
@@ -87,11 +87,11 @@ def test_welchs_interval_covers_a_true_difference():
 
 
 def test_a_sweep_without_variants_lists_how_to_run_each(tmp_path):
-    made = numbers(simulate(HEADS_GRID, FAST))
-    assert [row["sweep"] for row in made["confounds"]] == [confound.sweep for confound in concerned(simulate())]
-    assert all(row["contrasts"] == [] for row in made["confounds"])
-    for row in made["confounds"]:
-        load_grid(row["sweep"])
+    rows = summarise(simulate(HEADS_GRID, FAST)).confounds
+    assert [row.sweep for row in rows] == [confound.sweep for confound in concerned(simulate())]
+    assert all(row.contrasts == () for row in rows)
+    for row in rows:
+        load_grid(row.sweep)
 
 
 def test_a_report_shows_the_differences_under_both_values(tmp_path):

@@ -1,28 +1,44 @@
+import math
 import re
 from dataclasses import replace
 
 import pytest
+from pypdf import PdfReader
 
 from simulated import DATASIZE_GRID, HEADS_GRID, World, simulate
 from study.config import Grid, StudySettings
-from study.markdown import fixed, written
-from study.summary import numbers
+from study.markdown import markdown
+from study.report import build_report
+from study.report_text import document
+from study.rounding import between, epochs, fixed, percent, points
+from study.summary import summarise
 
 
 @pytest.fixture(scope="module")
-def made():
-    return numbers(simulate(HEADS_GRID, World(epochs=12)))
+def report():
+    return summarise(simulate(HEADS_GRID, World(epochs=12)))
 
 
-def test_the_tables_hold_the_numbers_of_the_json(made):
-    text = written(made)
-    for score in made["scores"]:
-        accuracy = score["accuracy"]
-        assert f"| {score['cell']} | 15 | {100 * accuracy['mean']:.1f} | {100 * accuracy['sd']:.2f} |" in text
-    for claim in made["claims"]:
-        assert re.search(rf"^\| {claim['claim']} \|.*\*\*{claim['outcome']}\*\*", text, flags=re.MULTILINE)
-    assert len(made["comparisons"]) / 2 == len(re.findall(r"^\| \S+ \N{MINUS SIGN} \S+ \|", text, flags=re.MULTILINE))
-    assert made["provenance"]["commit"] in text
+def written(report):
+    return markdown(document(report))
+
+
+def part(text, title):
+    """The text below a heading, up to the next."""
+    return re.split(r"^#+ ", text.partition(f"# {title}\n")[2], maxsplit=1, flags=re.MULTILINE)[0]
+
+
+def test_the_tables_hold_the_numbers_of_the_report(report):
+    text = written(report)
+    for score in report.scores:
+        assert f"| {score.cell} | 15 | {percent(score.accuracy.mean)} | {percent(score.accuracy.sd, 2)} |" in text
+    for claim in report.claims:
+        assert re.search(rf"^\| \*\*{claim.claim}\*\* \|.*\*\*{claim.outcome}\*\*", text, flags=re.MULTILINE)
+        for finding in claim.findings:
+            assert f"| {finding.state} |" in text
+    rows = re.findall(r"^\| \S+ \N{MINUS SIGN} \S+ \|", part(text, "Differences between cells"), flags=re.MULTILINE)
+    assert len(rows) == len(report.comparisons) / 2 == 6
+    assert report.provenance.commit in text
 
 
 def cells(text, start):
@@ -31,42 +47,42 @@ def cells(text, start):
     return [cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]]
 
 
-def test_the_ceiling_has_a_row_and_scores_their_share_of_the_way_to_it(made):
-    text = written(made)
-    top, at = made["ceiling"], cells(text, "Cell").index("share of gain [%]")
-    assert cells(text, "*ceiling (true state)*")[1:3] == [str(top["n"]), f"{100 * top['mean']:.1f}"]
+def test_the_ceiling_has_a_row_and_scores_their_share_of_the_way_to_it(report):
+    text = part(written(report), "Final scores")
+    top, at = report.ceiling, cells(text, "Cell").index("share")
+    assert cells(text, "*ceiling (true state)*")[1:3] == [str(top.n), f"{100 * top.mean:.1f}"]
     assert cells(text, "*ceiling (true state)*")[at] == "100"
-    for score in made["scores"]:
-        gained = (score["accuracy"]["mean"] - made["floor"]["accuracy"]) / (top["mean"] - made["floor"]["accuracy"])
-        assert cells(text, score["cell"])[at] == f"{100 * gained:.0f}"
+    for score in report.scores:
+        gained = (score.accuracy.mean - report.floor["accuracy"]) / (top.mean - report.floor["accuracy"])
+        assert cells(text, score.cell)[at] == f"{100 * gained:.0f}"
 
 
 def test_without_a_ceiling_there_is_no_word_of_it():
-    text = written(numbers(simulate(HEADS_GRID.model_copy(update={"ceiling": False}), World(epochs=6))))
+    text = written(summarise(simulate(HEADS_GRID.model_copy(update={"ceiling": False}), World(epochs=6))))
     assert "| Cell | n | accuracy" in text
     assert "eiling" not in text
-    assert "share of gain" not in text
+    assert "possible gain" not in text
 
 
-def test_confounds_that_were_run_are_shown_under_both_values(made):
-    assert "Confounds" not in written(made)
+def test_confounds_that_were_run_are_shown_under_both_values(report):
+    assert "`frames.split`: " not in written(report)
     record = simulate(HEADS_GRID, World(epochs=6))
     other = simulate(HEADS_GRID, World(epochs=6), seed=1, settings=StudySettings(frames={"split": "frame"}))
-    own = numbers(replace(record, variants={"frames.split": other}))
-    found = written(own)
-    assert "Confounds" in found
-    (row,) = [row for row in own["confounds"] if row["contrasts"]]
-    listed = [line for line in found.splitlines() if line.startswith("| `frames.split` | episode | frame |")]
-    assert len(listed) == len(row["contrasts"]) == 3
-    for line, contrast in zip(listed, row["contrasts"], strict=True):
-        assert f"| {contrast['name']} | 15, 15 | {fixed(contrast['here']['value'], 2, 100, sign=True)} |" in line
-        assert f"| {fixed(contrast['change']['value'], 2, 100, sign=True)} |" in line
-        assert line.endswith(f"| {contrast['state']} |")
-        assert line.count("|") == 1 + len(cells(found, "Setting"))
+    own = summarise(replace(record, variants={"frames.split": other}))
+    text = part(written(own), "`frames.split`: episode here, frame in `heads`")
+    (row,) = [row for row in own.confounds if row.contrasts]
+    assert len(row.contrasts) == 3
+    for contrast in row.contrasts:
+        line = cells(text, contrast.name)
+        assert line[1:3] == ["15", points(contrast.here.value)]
+        assert line[4:6] == ["15", points(contrast.there.value)]
+        assert line[7] == points(contrast.change.value)
+        assert line[-1] == contrast.state
+        assert len(line) == len(cells(text, "Contrast"))
 
 
-def test_every_row_of_a_table_has_the_columns_of_its_head(made):
-    for block in re.findall(r"(?:^\|.*\n)+", written(made), flags=re.MULTILINE):
+def test_every_row_of_a_table_has_the_columns_of_its_head(report):
+    for block in re.findall(r"(?:^\|.*\n)+", written(report), flags=re.MULTILINE):
         assert len({len(re.findall(r"(?<!\\)\|", line)) for line in block.splitlines()}) == 1
 
 
@@ -81,15 +97,24 @@ def test_every_row_of_a_table_has_the_columns_of_its_head(made):
     ids=lambda item: getattr(item, "name", None),
 )
 def test_other_grids_and_unfinished_sweeps_have_tables_too(grid, unfinished):
-    text = written(numbers(simulate(grid, World(epochs=6), unfinished=unfinished)))
+    text = written(summarise(simulate(grid, World(epochs=6), unfinished=unfinished)))
     assert ("Incomplete" in text) == bool(unfinished)
-    assert "None" not in text
-    assert "nan" not in text
+    assert re.findall(r"\b(?:None|nan|inf)\b", text) == []
 
 
 def test_numbers_keep_their_sign_and_their_words():
     assert fixed(-0.0001, 2) == "0.00"
     assert fixed(-0.0123, 2, 100, sign=True) == "\N{MINUS SIGN}1.23"
     assert fixed(0.01, 1, 100, sign=True) == "+1.0"
-    assert fixed("never", 0) == "never"
-    assert fixed(None, 3) == "\N{EM DASH}"
+    assert fixed(math.inf, 0) == "never"
+    assert fixed(None, 3) == fixed(math.nan, 3) == "\N{EM DASH}"
+    assert between(math.nan, math.nan, epochs) == "\N{EM DASH}"
+    assert between(math.inf, math.inf, epochs) == "never"
+    assert between(6, math.inf, epochs) == "6 to never"
+
+
+def test_words_from_outside_stay_words_in_both_renderings(tmp_path):
+    grid = Grid(name="two", title="A | <b>b</b> *c* `d` #e _f_ \\ $g$", heads=("rec",), policy_seeds=2)
+    record = simulate(grid, World(epochs=6))
+    assert "## A \\| \\<b>b\\</b> \\*c\\* \\`d\\` \\#e \\_f\\_ \\\\ $g$" in written(summarise(record))
+    assert grid.title in " ".join(PdfReader(build_report(record, tmp_path)).pages[0].extract_text().split())

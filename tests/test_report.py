@@ -14,7 +14,7 @@ from simulated import DATASIZE_GRID, HEADS_GRID, World, simulate
 from study import report
 from study.config import BadInputError, Grid
 from study.report import build_report
-from study.summary import numbers
+from study.summary import summarise
 
 
 def pages(pdf):
@@ -208,11 +208,11 @@ def test_a_sweep_that_varies_one_setting_is_found_and_takes_nobodys_place(tracke
     assert {name: one.grid.name for name, one in back.items()} == {"frames.split": "pair"}
     assert tracker.read_sweep("pair").settings == record.settings
     assert report.main(["pair", "--format", "md", "--tracking", tracker.uri]) == 0
-    assert "| `frames.split` | episode | frame | full" in capsys.readouterr().out
+    assert "`frames.split`: episode here, frame in `pair-split`" in capsys.readouterr().out
 
 
 def test_compare_takes_files_folders_and_sweeps_in_mlflow(tracker, committed, tmp_path, capsys):
-    (tmp_path / "report.json").write_text(json.dumps(numbers(committed[0])))
+    (tmp_path / "report.json").write_bytes(summarise(committed[0]).json())
     for other in (tmp_path / "report.json", f"pair@{tracker.uri}", f"pair:laptop@{tracker.uri}"):
         assert report.main(["compare", str(tmp_path), str(other)]) == 0
         assert "rec (the same result), full (the same result)" in capsys.readouterr().out
@@ -226,7 +226,7 @@ def test_compare_takes_files_folders_and_sweeps_in_mlflow(tracker, committed, tm
 
 def test_compare_draws_into_the_file_that_it_is_given(committed, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "report.json").write_text(json.dumps(numbers(committed[0])))
+    (tmp_path / "report.json").write_bytes(summarise(committed[0]).json())
     (tmp_path / "my pictures").mkdir()
     for file, shown in ((Path("my pictures/a.svg"), "![Dot plot"), (tmp_path / "my pictures" / "b.pdf", "\n[Dot plot")):
         assert report.main(["compare", ".", ".", "--figure", str(file)]) == 0

@@ -1,0 +1,123 @@
+"""A document as data: headings, paragraphs, tables and figures, whose texts are inline Markdown.
+
+Inline Markdown here is `code`, **bold**, *italic*, a backslash before a character that stands for itself, and, in a
+table's cell, a new line.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+
+class Inline(str):
+    """Text that is inline Markdown already."""
+
+    __slots__ = ()
+
+
+def plain(text: object) -> Inline:
+    """Return words from outside as inline Markdown that shows them as they are; Inline stays as it is."""
+    if isinstance(text, Inline):
+        return text
+    return Inline(re.sub(r"([\\`*_\[\]|~#<&])", r"\\\1", re.sub(r"\s+", " ", str(text))))
+
+
+def code(text: object) -> Inline:
+    """Return words from outside in fixed width."""
+    return Inline(f"`{' '.join(re.sub(r'[`|]', ' ', str(text)).split())}`")
+
+
+def bold(text: object) -> Inline:
+    """Return words from outside in bold."""
+    return Inline(f"**{plain(text)}**")
+
+
+def italic(text: object) -> Inline:
+    """Return words from outside in italics."""
+    return Inline(f"*{plain(text)}*")
+
+
+def lines(parts: Sequence[object]) -> Inline:
+    """Return the lines of a table's cell."""
+    return Inline("\n".join(map(plain, parts)))
+
+
+Row = Sequence[object]
+
+
+@dataclass(frozen=True)
+class Heading:
+    """A heading: 1 is the document's title."""
+
+    level: int
+    text: str
+
+
+@dataclass(frozen=True)
+class Paragraph:
+    """A paragraph; a notice stands out."""
+
+    text: str
+    notice: bool = False
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table: `align` has l, c or r for each column; `notes` stand below it."""
+
+    header: tuple[str, ...]
+    align: str
+    rows: tuple[tuple[str, ...], ...]
+    caption: str = ""
+    notes: str = ""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure in a file, its caption, and what it shows in words."""
+
+    file: str
+    caption: str
+    alt: str
+
+
+Block = Heading | Paragraph | Table | Picture
+
+
+def table(header: Sequence[str], rows: Sequence[Row], left: int = 1) -> list[Table]:
+    """Return a table whose first `left` columns are flush left, the others flush right; none without a row.
+
+    The header is inline Markdown; what is no `Inline` in a row is escaped.
+    """
+    if not rows:
+        return []
+    align = "l" * left + "r" * (len(header) - left)
+    return [Table(tuple(header), align, tuple(tuple(map(plain, row)) for row in rows))]
+
+
+def parse(text: str, pictures: Mapping[str, Sequence[Picture]]) -> Iterator[Block]:
+    """Yield the blocks of a text, which blank lines separate.
+
+    `#` starts a heading and `>` a notice. `Figures PLACE` stands for the pictures of a place. `Table: CAPTION` is
+    followed by a header, a line of alignments, rows, and notes; a table without any row is left out.
+    """
+    for block in filter(None, (part.strip() for part in re.split(r"\n\s*\n", text))):
+        words = " ".join(block.split())
+        if heading := re.fullmatch(r"(#+) (.*)", words):
+            yield Heading(len(heading[1]), heading[2])
+        elif words.startswith("Figures "):
+            yield from pictures.get(words.removeprefix("Figures "), ())
+        elif found := re.fullmatch(r"Table:(.*?)((?:^\|[^\n]*\n?)+)(.*)", block, re.DOTALL | re.MULTILINE):
+            header, marks, *rows = (_cells(line) for line in found[2].splitlines())
+            caption, notes = (" ".join(part.split()) for part in (found[1], found[3]))
+            align = "".join("c" if mark[0] == ":" else "r" if mark[-1] == ":" else "l" for mark in marks)
+            if rows:
+                yield Table(header, align, tuple(rows), caption, notes)
+        else:
+            yield Paragraph(words.removeprefix("> "), words.startswith("> "))
+
+
+def _cells(line: str) -> tuple[str, ...]:
+    return tuple(cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1])
