@@ -193,7 +193,7 @@ class Committing:
             lambda name, device: self._runs[name].note(device=device),
             lambda name, *epoch: self._runs[name].log(*epoch),
             self.retry,
-            self._display.tick,
+            self.tick,
         )
 
     def started(self, name: str, host: str, process: int) -> None:
@@ -235,6 +235,12 @@ class Committing:
         self._patiently(self._tracker.fail, self._runs.pop(name), failure.reason, permanent=not failure.transient)
         self._trials.fail(name, failure.reason)
         self._display.fail(name)
+
+    def tick(self) -> None:
+        """Write live curves, and draw the display again."""
+        for run in self._runs.values():
+            run.flush_live()
+        self._display.tick()
 
     def close(self) -> dict[str, str]:
         """End the sweep's run; returns the cells that failed, with the reasons."""

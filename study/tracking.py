@@ -17,7 +17,6 @@ import math
 import os
 import platform
 import tempfile
-import threading
 import time
 from collections.abc import Collection, Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext, suppress
@@ -48,15 +47,13 @@ PERMANENT = "permanent"  # tag of a failed attempt: another try would not help
 SIGN = 5.0  # [s] between two signs of life
 PARENT = "mlflow.parentRunId"
 FLUSH = 2.0  # [s] between two writes of live curves
-# SQLite bears one writer: live curves of one cell wait while another cell is committed.
-_ONE_WRITER = threading.RLock()
 
 Status = Literal["FINISHED", "FAILED", "KILLED"]
 
 
 @dataclass
 class CellRun:
-    """One attempt at a cell. Live points gather here, and a thread of its own writes them, so training never waits."""
+    """One attempt at a cell. Points and tags gather here until `flush` writes them, many at a time."""
 
     run_id: str
     key: str
@@ -67,21 +64,16 @@ class CellRun:
     _pending: list[Metric] = field(default_factory=list)
     _tags: dict[str, str] = field(default_factory=dict)
     _signed: float = -math.inf
+    _flushed: float = -math.inf
     _seen: set[tuple[str, int]] = field(default_factory=set)
-    _lock: threading.Lock = field(default_factory=threading.Lock)
-    _end: threading.Event = field(default_factory=threading.Event)
-    _thread: threading.Thread | None = None
 
     def log(self, stage: str, epoch: int, metrics: Mapping[str, float]) -> None:
         """Take the points of one epoch, named such as "test/loss_rec". A point that is there already is left out."""
-        self._add((f"{stage}/{name}", epoch, float(value)) for name, value in metrics.items())
-        self._start_writing()
+        self.add((f"{stage}/{name}", epoch, float(value)) for name, value in metrics.items())
 
     def note(self, **tags: str) -> None:
         """Take tags of the attempt; the time goes with them as a sign of life."""
-        with self._lock:
-            self._tags |= tags | {ALIVE: str(time.time_ns() // 1_000_000)}
-        self._start_writing()
+        self._tags |= tags | {ALIVE: str(time.time_ns() // 1_000_000)}
 
     def progress(self, stage: str, done: int, whole: int) -> None:
         """Take how far the training is; a few times a minute is enough for those who look."""
@@ -90,50 +82,26 @@ class CellRun:
             self._signed = now
             self.note(progress=f"{stage} {done}/{whole}")
 
-    def _start_writing(self) -> None:
-        if self._thread is None and not self._end.is_set():
-            self._thread = threading.Thread(target=self._write_on, daemon=True, name=f"log {self.cell.label}")
-            self._thread.start()
+    def add(self, points: Iterable[Point]) -> None:
+        """Take points, less those that are there already."""
+        for name, step, value in points:
+            if (name, step) not in self._seen:
+                self._seen.add((name, step))
+                self._pending.append(Metric(name, value, self.started + step, step))
 
-    def _add(self, points: Iterable[Point]) -> None:
-        with self._lock:
-            for name, step, value in points:
-                if (name, step) not in self._seen:
-                    self._seen.add((name, step))
-                    self._pending.append(Metric(name, value, self.started + step, step))
-
-    def _write_on(self) -> None:
-        while not self._end.wait(FLUSH):
-            # What cannot be written now waits in memory; commit writes it or says why it cannot.
+    def flush_live(self) -> None:
+        """Write what has gathered, every now and then. What cannot be written waits: `commit` writes it or says why."""
+        if time.monotonic() - self._flushed >= FLUSH:
+            self._flushed = time.monotonic()
             with suppress(*TROUBLES):
-                self._flush()
+                self.flush()
 
-    def _flush(self) -> None:
-        with self._lock:
-            batch, self._pending = self._pending, []
-            tags, self._tags = self._tags, {}
-        if not batch and not tags:
-            return
-        try:
-            with _ONE_WRITER:
-                self.client.log_batch(self.run_id, metrics=batch, tags=[RunTag(*tag) for tag in tags.items()])
-        except BaseException:
-            with self._lock:  # written in part or whole, it may be written again: the same points are the same rows
-                self._pending = batch + self._pending
-                self._tags = tags | self._tags
-            raise
-
-    def stop(self, *, wait: bool = True) -> None:
-        """End the thread. Points it has not written stay."""
-        self._end.set()
-        if wait and self._thread is not None:
-            self._thread.join()
-
-    def finish(self, points: Iterable[Point]) -> None:
-        """Write the whole curves, less what was written live."""
-        self.stop()
-        self._add(points)
-        self._flush()
+    def flush(self) -> None:
+        """Write what has gathered. Written in part, it may be written again: the same points are the same rows."""
+        if self._pending or self._tags:
+            tags = [RunTag(*tag) for tag in self._tags.items()]
+            self.client.log_batch(self.run_id, metrics=self._pending, tags=tags)
+            self._pending, self._tags = [], {}
 
 
 @dataclass(frozen=True)
@@ -395,8 +363,7 @@ class Tracker:
         """
         if result.key != cell_run.key:
             raise ValueError(f"result of cell {result.key} given for the run of {cell_run.key}")
-        cell_run.stop()
-        with _ONE_WRITER, self._guard():
+        with self._guard():
             other = self._finished([cell_run.key]).get(cell_run.key)
             if other is not None and other.info.run_id != cell_run.run_id:
                 self._close(cell_run.run_id, "KILLED", {"superseded_by": other.info.run_id})
@@ -408,7 +375,8 @@ class Tracker:
                 self.client.log_text(cell_run.run_id, diff, "uncommitted.diff")
             scores = scores_of(result)
             self._log_seeds(cell_run, result.curves, scores)
-            cell_run.finish(cell_points(result.curves))
+            cell_run.add(cell_points(result.curves))
+            cell_run.flush()
             numbers, words = facts_of(result.facts)
             words["state"] = "finished"
             for ending, values in bands(scores).items():
@@ -459,15 +427,14 @@ class Tracker:
 
         `permanent`: the next start of the sweep need not try again.
         """
-        cell_run.stop()
         with self._guard():
+            cell_run.flush()
             self.client.log_text(cell_run.run_id, masked(reason), "failure.txt")
             tags = {"reason": masked(reason)} | ({PERMANENT: "true"} if permanent else {})
             self._close(cell_run.run_id, "FAILED", tags)
 
     def interrupt(self, cell_run: CellRun, reason: str = "stopped") -> None:
         """End an attempt that was stopped, quickly; when the store does not answer, the next attempt closes it."""
-        cell_run.stop(wait=False)
         with suppress(TrackerLostError), self._guard(), few_tries():
             self._close(cell_run.run_id, "KILLED", {"reason": reason})
 
