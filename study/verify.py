@@ -170,7 +170,7 @@ def compute_again(plan: Plan, recorded: CellResult, display: Display) -> CellRes
         again, _ = run_flow(
             cell_flow(job, one_share=bool(use)), engine, lambda *how: display.progress(recorded.key, *how)
         )
-    return again
+        return CellResult.load(again.save(Path(scratch) / "result"))  # as the recorded one was
 
 
 # --- the command ----------------------------------------------------------------------------------------------------
