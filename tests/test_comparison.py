@@ -1,5 +1,6 @@
 import json
 import re
+from pathlib import Path
 
 import pytest
 
@@ -186,3 +187,8 @@ def test_a_file_that_is_no_report_is_refused(text, message, tmp_path):
     file.write_text(text)
     with pytest.raises(BadInputError, match=message):
         read_report(file)
+
+
+@pytest.mark.parametrize("folder", sorted(Path("reports/reference").glob("*/")), ids=lambda folder: folder.name)
+def test_a_committed_report_is_read_and_written_again_without_a_change(folder):
+    assert json.loads(read_report(folder).json()) == json.loads((folder / "report.json").read_text())
