@@ -560,22 +560,19 @@ def picture_rows(rows: Rows, columns: int = 10) -> Figure:
             top -= space
             continue
         figure.text(0, (top - side / 2) / height, name, va="center", fontsize=7.5)
-        strip = _strip(pictures)
-        wide = side * len(pictures)
-        axes = figure.add_axes((names / WIDTH, (top - side) / height, wide / WIDTH, side / height), frame_on=False)
-        axes.imshow(strip, interpolation="none", aspect="auto")
-        axes.set_axis_off()
         top -= side
+        _strip(figure, (names / WIDTH, top / height, side * len(pictures) / WIDTH, side / height), pictures)
     return figure
 
 
-def _strip(pictures: NDArray[np.uint8], larger: int = 3, gap: int = 8) -> NDArray[np.uint8]:
-    """Return pictures side by side, on white: one image draws much faster than many, and viewers blur small ones."""
+def _strip(figure: Figure, place: tuple[float, float, float, float], pictures: NDArray[np.uint8]) -> None:
+    """Draw pictures side by side as one image, much faster than many; enlarged, as viewers blur small ones."""
     colour = pictures if pictures.ndim == 4 else np.repeat(pictures[..., None], 3, axis=3)
-    colour = colour.repeat(larger, axis=1).repeat(larger, axis=2)
-    framed = np.pad(colour, ((0, 0), (0, gap), (0, gap), (0, 0)), constant_values=255)
-    strip: NDArray[np.uint8] = np.concatenate(list(framed), axis=1)
-    return strip
+    colour = colour.repeat(3, axis=1).repeat(3, axis=2)
+    framed = np.pad(colour, ((0, 0), (0, 8), (0, 8), (0, 0)), constant_values=255)
+    axes = figure.add_axes(place, frame_on=False)
+    axes.imshow(np.concatenate(list(framed), axis=1), interpolation="none", aspect="auto")
+    axes.set_axis_off()
 
 
 # --- data -----------------------------------------------------------------------------------------------------------
@@ -684,10 +681,7 @@ def contact_sheet(sets: Mapping[str, Sequence[tuple[str, NDArray[np.uint8]]]], c
         for index, (text, pictures) in enumerate(frames):
             row, column = divmod(index, columns)
             left, low = column * WIDTH / columns, top - row * (side + words) - side
-            place = (left / WIDTH, low / height, 3 * side / WIDTH, side / height)
-            axes = figure.add_axes(place, frame_on=False)
-            axes.imshow(_strip(pictures), interpolation="none", aspect="auto")
-            axes.set_axis_off()
+            _strip(figure, (left / WIDTH, low / height, 3 * side / WIDTH, side / height), pictures)
             figure.text(left / WIDTH, (low - 0.01) / height, text, fontsize=5.5, va="top", linespacing=1.1)
         top -= lines[name] * (side + words)
     return figure
