@@ -43,6 +43,7 @@ from study.stages import Task
 
 CONNECT = 10.0  # [s] a scheduler has to answer in
 SIZE = 5.0  # [s] between two looks at how many workers there are
+GPU_DRIVERS = ("/dev/nvidiactl", "/dev/kfd", "/dev/dxg")  # of CUDA, ROCm, and either in WSL
 GPU = "GPU"  # the resource that a worker with a GPU has one of
 CERTIFICATES = {"tls_ca_file": "ca.pem", "tls_client_cert": "cert.pem", "tls_client_key": "key.pem"}
 JOB_CLASSES = ("SLURMCluster", "PBSCluster", "SGECluster", "LSFCluster", "OARCluster", "MoabCluster", "HTCondorCluster")
@@ -380,9 +381,9 @@ def start_jobs(kind: Callable[..., Any], arguments: Mapping[str, Any], workers: 
 
 def visible_gpus(device: str) -> list[str]:
     """Return CUDA's names of the GPUs that `--device` asks for: all of them for auto and cuda, one for cuda:N."""
-    if device == "cpu":
+    if device == "cpu" or (device == "auto" and not any(Path(file).exists() for file in GPU_DRIVERS)):
         return []
-    import torch  # noqa: PLC0415 - a second's work that a CPU run does not need
+    import torch  # noqa: PLC0415 - seconds of work that a CPU run does not need
 
     names = os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")
     count = torch.cuda.device_count()
