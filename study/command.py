@@ -138,6 +138,8 @@ def cannot_write(path: Path, error: OSError) -> str:
 def stoppable(work: Callable[[], int], command: str) -> int:
     """Do the work and return its exit code; Ctrl-C, or a batch system's SIGTERM, ends it with how to go on.
 
+    So does the timer of a time limit (SIGALRM), with EXIT_AGAIN.
+
     A signal does not break into what runs, which may be a library's write: the work asks `check_stopped` now and then.
     Work that does not ask in time is left where it is, as if it had been killed, which every part of a study survives.
     """
@@ -152,7 +154,7 @@ def stoppable(work: Callable[[], int], command: str) -> int:
         return work()
     except KeyboardInterrupt:
         stop.leave(at_once=False)
-        return EXIT_INTERRUPTED
+        return stop.code
     finally:
         _stops.remove(stop)
         stop.timer.cancel()
@@ -164,13 +166,14 @@ class _Stop:
     """Remembers that the user wants to stop, and sees to it that this happens soon."""
 
     def __init__(self, command: str) -> None:
-        self.command, self.pressed = command, False
+        self.command, self.pressed, self.code = command, False, EXIT_INTERRUPTED
         self.timer = threading.Timer(STOP_SECONDS, self.leave)
         self.timer.daemon = True
 
-    def press(self, *_: object) -> None:
+    def press(self, number: int, _: object) -> None:
         if not self.pressed:  # a second Ctrl-C changes nothing
             self.pressed = True
+            self.code = EXIT_AGAIN if number == signal.SIGALRM else EXIT_INTERRUPTED
             self.timer.start()
 
     def leave(self, *, at_once: bool = True) -> None:
@@ -179,7 +182,7 @@ class _Stop:
         print(f"{show_cursor}\nStopped. Nothing that was finished is lost. To go on: {self.command}", file=sys.stderr)
         if at_once:
             sys.stderr.flush()
-            os._exit(EXIT_INTERRUPTED)
+            os._exit(self.code)
 
 
 _stops: list[_Stop] = []

@@ -198,5 +198,9 @@ def check_run_options(options: argparse.Namespace) -> None:
         raise BadInputError("--workers counts processes on this machine; a cluster has its own: leave one of them out")
     if options.certificates and not (options.cluster or "").startswith("tls://"):
         raise BadInputError("--certificates goes with --cluster tls://host:port")
+    if options.cluster:
+        from study.engine.cluster import check_cluster  # noqa: PLC0415 - Dask, which only a run needs
+
+        check_cluster(options.cluster, options.certificates)
     if options.threads < 1 or (options.device not in {"auto", "cpu"} and not options.cluster):
         check_machine(options)

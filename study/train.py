@@ -15,7 +15,6 @@ import importlib.util
 import shutil
 import signal
 import sys
-import time
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -24,7 +23,7 @@ from typing import TYPE_CHECKING
 from filelock import FileLock, Timeout
 
 from study.cell import cell_flow, product_folders
-from study.command import EXIT_AGAIN, EXIT_FAILED, EXIT_INTERRUPTED, Parser, run, stoppable, typed
+from study.command import EXIT_AGAIN, EXIT_FAILED, Parser, run, stoppable, typed
 from study.config import BadInputError
 from study.data import DATA, data_flow
 from study.display import Display
@@ -59,7 +58,6 @@ def parser() -> Parser:
 
 def main(args: Sequence[str]) -> int:
     """Run the command and return its exit code."""
-    began = time.monotonic()
     options = parser().parse(args)
     limit = options.limit_seconds
     if limit is not None and not limit > 0:
@@ -69,11 +67,9 @@ def main(args: Sequence[str]) -> int:
     if limit is not None:
         signal.setitimer(signal.ITIMER_REAL, limit)
     try:
-        code = stoppable(lambda: train(plan, options.out, options), typed("study.train", args))
+        return stoppable(lambda: train(plan, options.out, options), typed("study.train", args))
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
-    up = limit is not None and time.monotonic() - began >= limit
-    return EXIT_AGAIN if up and code == EXIT_INTERRUPTED else code
 
 
 def train(plan: Plan, out: Path, options: argparse.Namespace) -> int:

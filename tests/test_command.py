@@ -4,25 +4,27 @@ import json
 import signal
 import subprocess
 import sys
+import time
 
 import pytest
 
-from study.command import EXIT_INTERRUPTED, check_stopped, stoppable, unbroken
+from running import environment, sweep, working_folder
+from study.command import EXIT_AGAIN, EXIT_INTERRUPTED, STOP_SECONDS, check_stopped, stoppable
 
 HEAVY = ("torch", "lightning", "mlflow", "optuna", "matplotlib", "highway_env", "cv2", "pandas", "distributed")
 
 
-def sweep(*words, cwd=None):
-    return subprocess.run(
-        [sys.executable, "-m", "study.sweep", *words], capture_output=True, text=True, check=False, cwd=cwd
-    )
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A working folder of a newcomer: sweep files and nothing else."""
+    return working_folder(tmp_path_factory.mktemp("command"))
 
 
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
         (["heds"], "choose from datasize, datasize-budget-steps"),
-        (["heads", "--profile", "desktop"], "choose from laptop, paper, smoke"),
+        (["heads", "--profile", "desktop"], "choose from laptop, paper, smoke, tiny"),
         (["heads", "--encoder.epohcs", "5"], "did you mean --encoder.epochs?"),
         (["heads", "--encoder.epochs", "five"], "encoder.epochs"),
         (["heads", "--heads", "[rec,rec+plam]"], "choose from rec, rec+pred, rec+plan, full"),
@@ -30,20 +32,29 @@ def sweep(*words, cwd=None):
         (["heads", "--fractions", "0"], "greater than 0"),
         (["heads", "--workers", "0"], "1 or more"),
         (["heads", "--json"], "--dry-run"),
-        (["heads", "--qeue=postgresql://me:secret@host/db"], "--qeue=postgresql://***@host/db"),
+        (["heads", "--threads", "0"], "1 or more"),
+        (["heads", "--device", "cuda:7"], "not on this machine"),
+        (["heads", "--trakcing=postgresql://me:secret@host/db"], "--trakcing=postgresql://***@host/db"),
+        (["heads", "--cluster", "tcp://10.0.0.1:8786"], "not encrypted"),
+        (["heads", "--cluster", "tls://127.0.0.1:8786"], "--certificates"),
+        (["heads", "--cluster", "somewhere"], "tls://host:8786"),
+        (["heads", "--cluster", "tcp://127.0.0.1:1", "--workers", "2"], "leave one of them out"),
         ([], "NAME"),
     ],
 )
-def test_bad_input_is_one_clear_error_and_exit_code_2(words, expected):
-    done = sweep(*words)
+def test_bad_input_is_one_clear_error_exit_code_2_and_leaves_nothing(folder, words, expected):
+    done = sweep(folder, *words)
     assert done.returncode == 2
     assert expected in done.stderr
     assert "secret" not in done.stderr
     assert "Traceback" not in done.stderr
+    assert {path.name for path in folder.iterdir()} == {"sweeps"}
 
 
-def test_dry_run_speaks_json():
-    done = sweep("heads", "--dry-run", "--json", "--profile", "smoke", "--heads", "full", "--encoder_seeds", "2")
+def test_dry_run_speaks_json(folder):
+    done = sweep(
+        folder, "heads", "--dry-run", "--json", "--profile", "smoke", "--heads", "full", "--encoder_seeds", "2"
+    )
     facts = json.loads(done.stdout)
     assert set(facts) == {
         "sweep",
@@ -64,26 +75,27 @@ def test_dry_run_speaks_json():
 
 
 @pytest.mark.parametrize("words", [["--help"], ["heads", "--dry-run"]])
-def test_help_and_dry_run_load_nothing_heavy(words):
+def test_help_and_dry_run_load_nothing_heavy(folder, words):
     code = (
         "import sys; from study.sweep import main\n"
         f"try: main({words!r})\n"
         "except SystemExit: pass\n"
         f"print([name for name in {HEAVY!r} if name in sys.modules], file=sys.stderr)"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=folder, env=environment()
+    )
     assert done.stderr.strip() == "[]"
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_stop_waits_for_what_must_not_break(number, capsys):
+def test_a_stop_waits_until_the_work_asks_for_it(number, capsys):
     done, before = [], signal.getsignal(number)
 
     def work():
-        with unbroken():
-            with unbroken():
-                signal.raise_signal(number)
-            done.append("whole")
+        signal.raise_signal(number)
+        done.append("whole")
+        check_stopped()
         done.append("more")
         return 0
 
@@ -91,18 +103,29 @@ def test_a_stop_waits_for_what_must_not_break(number, capsys):
     assert done == ["whole"]
     assert "To go on: this again" in capsys.readouterr().err
     assert signal.getsignal(number) is before
+    check_stopped()  # the stop is over with the command that it stopped
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_a_stop_that_python_dropped_comes_again():
-    class Finaliser:
-        def __del__(self):
-            signal.raise_signal(signal.SIGINT)
-
+def test_a_time_limit_ends_the_work_with_a_code_of_its_own():
     def work():
-        Finaliser()
+        signal.raise_signal(signal.SIGALRM)
         check_stopped()
         return 0
 
-    assert stoppable(work, "") == EXIT_INTERRUPTED
-    check_stopped()  # is over then
+    assert stoppable(work, "") == EXIT_AGAIN
+
+
+def test_work_that_does_not_ask_is_left_where_it_is():
+    code = (
+        "import signal, time; from study.command import stoppable\n"
+        "def work():\n"
+        "    signal.raise_signal(signal.SIGINT)\n"
+        "    time.sleep(60)\n"
+        "stoppable(work, 'this again')"
+    )
+    began = time.monotonic()
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == EXIT_INTERRUPTED
+    assert "To go on: this again" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert STOP_SECONDS <= time.monotonic() - began < 30

@@ -272,14 +272,10 @@ def cluster_engine(cluster: str, certificates: Path | None = None) -> DaskEngine
     Raises BadInputError for an address that does not answer or is not secured, certificates that do not match, and a
     file that cannot be used.
     """
+    check_cluster(cluster, certificates)
     _configure()
-    if cluster.endswith((".yaml", ".yml")):
-        return _job_engine(Path(cluster))
-    check_address(cluster)
-    if cluster.startswith("tls://") and certificates is None:
-        raise BadInputError(
-            f"{masked(cluster)} wants certificates; give the folder that holds them: --certificates DIR"
-        )
+    if is_file(cluster):
+        return start_jobs(*read_jobs(Path(cluster)), cluster)
     security = _security(certificates) if certificates else None
     try:
         client = Client(cluster, security=security, timeout=CONNECT, set_as_default=False)
@@ -290,6 +286,25 @@ def cluster_engine(cluster: str, certificates: Path | None = None) -> DaskEngine
             "scheduler', check address and port, and for tls:// that --certificates holds its certificates"
         ) from None
     return DaskEngine(client, partial(_close, client), masked(cluster))
+
+
+def is_file(cluster: str) -> bool:
+    """Return whether --cluster names a YAML file, not an address."""
+    return cluster.endswith((".yaml", ".yml"))
+
+
+def check_cluster(cluster: str, certificates: Path | None) -> None:
+    """Raise BadInputError for what `cluster_engine` cannot use, before anything is started."""
+    if is_file(cluster):
+        read_jobs(Path(cluster))
+        return
+    check_address(cluster)
+    if cluster.startswith("tls://") and certificates is None:
+        raise BadInputError(
+            f"{masked(cluster)} wants certificates; give the folder that holds them: --certificates DIR"
+        )
+    if certificates:
+        _security(certificates)
 
 
 def check_address(address: str) -> None:
@@ -338,7 +353,8 @@ def _make_certificates(folder: Path) -> Path:
     return folder
 
 
-def _job_engine(path: Path) -> DaskEngine:
+def read_jobs(path: Path) -> tuple[Callable[..., Any], dict[str, Any], int]:
+    """Return the dask-jobqueue class that a file names, its arguments, and how many workers to ask for."""
     content = read_yaml(path)
     if unknown := sorted(content.keys() - {"class", "arguments", "workers"}):
         raise BadInputError(f"{path}: unknown setting '{unknown[0]}'; choose from class, arguments, workers")
@@ -351,7 +367,7 @@ def _job_engine(path: Path) -> DaskEngine:
         import dask_jobqueue  # noqa: PLC0415 - an extra that only batch systems need
     except ModuleNotFoundError:
         raise BadInputError(f"{path} needs dask-jobqueue: pip install 'study[cluster]'") from None
-    return start_jobs(getattr(dask_jobqueue, name), dict(arguments), workers, str(path))
+    return getattr(dask_jobqueue, name), dict(arguments), workers
 
 
 def start_jobs(kind: Callable[..., Any], arguments: Mapping[str, Any], workers: int, source: str) -> DaskEngine:
