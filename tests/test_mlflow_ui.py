@@ -41,7 +41,7 @@ def server(empty_store, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def sweep(server, small_store, small_drives, tmp_path_factory):
+def sweep(server, small_store, small_drives):
     """A finished sweep of the four head sets: drawn curves, a real report, the card of real frames, models."""
     record = simulate(HEADS_GRID.model_copy(update={"policy_seeds": SEEDS, "ceiling": False}), World(epochs=EPOCHS))
     tracker = Tracker(server.uri)

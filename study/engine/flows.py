@@ -105,7 +105,8 @@ class _Flows:
 
     def _fill(self) -> None:
         """Submit tasks as long as the engine has room, and begin further flows when none are ready."""
-        slots, gpus = self._engine.slots(), self._engine.gpus()
+        # Where no worker has come yet, one task waits for the first: a cluster without any must not look like the end.
+        slots, gpus = max(1, self._engine.slots()), self._engine.gpus()
         while True:
             waiting = []
             for tried in self._ready:
