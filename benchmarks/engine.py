@@ -7,8 +7,8 @@ start, its live curves and its commit. The result that is committed is real: an 
 the epochs of `laptop`, trained on the frames of `smoke`.
 
 From these follows the share of a laptop `heads`: what all its tasks, reports and cells take, over what its stages are
-expected to take (`study.stages`). It is counted as if it ran alone, though the client works while the workers compute,
-so it is an upper bound. Printed are medians with the lowest and highest.
+expected to take (`study.stages`). It is an upper bound: the client works while the workers compute, but is counted as if
+everybody waited for it. Printed are medians with the lowest and highest.
 """
 
 from __future__ import annotations
@@ -33,12 +33,10 @@ from study.config import LATENT, load_profile
 from study.data import DATA, data_flow
 from study.engine.cluster import DaskEngine, local_engine
 from study.engine.flows import run_flow
-from study.engine.trials import Trials
 from study.plan import Plan, cell_jobs, make_plan
 from study.provenance import ROOT, provenance
 from study.result import CellResult
-from study.stages import POLICY, RESULT, Batch, Flow, Task, cell_cost
-from study.tracking import Tracker
+from study.stages import ENCODER, POLICY, RESULT, Batch, Flow, Task, cell_cost
 
 RESULT_FILE = Path(__file__).parent / "results" / "engine.json"
 WORKERS = 2
@@ -135,6 +133,10 @@ def train_cell(engine: DaskEngine, plan: Plan) -> tuple[CellResult, bytes]:
 
 def measure_tracking(plan: Plan, result: CellResult, network: bytes) -> Numbers:
     """What a sweep of CELLS cells takes in MLflow and Optuna, all with the same result."""
+    # Not at the top: workers load this file, too, and in a sweep they need no MLflow.
+    from study.engine.trials import Trials  # noqa: PLC0415
+    from study.tracking import Tracker  # noqa: PLC0415
+
     keys = {f"{number:016x}": result.cell for number in range(CELLS)}
     found: dict[str, list[float]] = {"cell_start_s": [], "cell_live_s": [], "cell_commit_s": [], "cell_trial_s": []}
     times: list[float] = [time.perf_counter()]
@@ -182,12 +184,11 @@ def count_work(plan: Plan) -> Numbers:
     """Tasks, reports and cells of a sweep, and the seconds that its stages are expected to take."""
     recording = plan.settings.recording
     drives = recording.encoder_episodes + recording.policy_episodes
-    works = plan.works.values()
     shares = {key: -(-2 * POLICY.cost(work) // SHARE_SECONDS) for key, work in plan.works.items()}
     expected = plan.data_cost.seconds + sum(
         cell_cost(plan.settings, cell, plan.grid.policy_seeds).seconds for cell in plan.cells.values()
     )
-    encoders = sum(cell_cost(plan.settings, work.cell, 0).seconds for work in works)
+    encoders = sum(ENCODER.cost(work) for work in plan.works.values())
     return {
         "cells": len(plan.cells),
         # Recording, choosing and rendering each drive, and the card; encoder, latents, result and the policies' shares.

@@ -3,8 +3,8 @@
 Encoder: `train_encoder` in a worker of the engine, as a sweep calls it (Lightning, checkpoints, progress and losses
 reported), against a bare torch loop over tensors in memory with the same networks, precision and optimiser, epoch by
 epoch in turn, and against a stock Lightning template with a DataLoader of two workers (`plain.py`). Each computes in
-one thread, as the tasks of a sweep do; the template's workers come on top. Policies: all 15 seeds of a cell, trained as two
-shares on two workers of an engine that is warm, against 15 plain fits one after the other. An epoch is all of it:
+one thread, as the tasks of a sweep do; the template's workers come on top. Policies: all 15 seeds of a cell, trained as
+two shares on two workers of an engine that is warm, against 15 plain fits one after the other. An epoch is all of it:
 training, evaluating the test split, reporting; of policies also sending the latents and joining the shares. Data are
 random: values cost no time.
 
