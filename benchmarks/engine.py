@@ -7,8 +7,8 @@ start, its live curves and its commit. The result that is committed is real: an 
 the epochs of `laptop`, trained on the frames of `smoke`.
 
 From these follows the share of a laptop `heads`: what all its tasks, reports and cells take, over what its stages are
-expected to take (`study.stages`). It is an upper bound: the client works while the workers compute, but is counted as if
-everybody waited for it. Printed are medians with the lowest and highest.
+expected to take (`study.stages`). That is an upper bound: the client works while the workers compute, and is counted as
+if everybody waited for it. Printed are medians with the lowest and highest.
 """
 
 from __future__ import annotations
