@@ -1,13 +1,18 @@
 """Training against what one would write first, and against the machine's limits: `python benchmarks/training.py`.
 
-Encoder: `train_encoder` as a sweep calls it (Lightning, checkpoints, progress and losses told through a pipe) against a
-bare torch loop over tensors in memory with the same networks, precision and optimiser, turn about by the epoch, and
-against a stock Lightning template with a DataLoader of two workers (`plain.py`). Policies: all 15 seeds by
-`train_policies` against one plain fit after the other. An epoch is all of it: training, evaluating the test split,
-reporting; of policies also its part of starting the processes. Data are random: values cost no time. Printed are
-medians with the lowest and highest; the floor of a stage is what its multiplications take at the speed of a large
-matrix product on this machine, or its bytes at the speed of a copy, whichever takes longer. `--quick` tries everything
-on almost no data, and keeps nothing.
+Encoder: `train_encoder` in a worker of the engine, as a sweep calls it (Lightning, checkpoints, progress and losses
+reported), against a bare torch loop over tensors in memory with the same networks, precision and optimiser, epoch by
+epoch in turn, and against a stock Lightning template with a DataLoader of two workers (`plain.py`). Each computes in
+one thread, as the tasks of a sweep do; the template's workers come on top. Policies: all 15 seeds of a cell, trained as
+two shares on two workers of an engine that is warm, against 15 plain fits one after the other. An epoch is all of it:
+training, evaluating the test split, reporting; of policies also sending the latents and joining the shares. Data are
+random: values cost no time.
+
+Printed are medians with the lowest and highest; the floor of a stage is what its multiplications take at the speed of a
+large matrix product on one core, or its bytes at the speed of a copy, whichever takes longer. On a processor that
+does not multiply bf16 itself everything is in float32, and what is left out is said and null in the result. Slow
+processors get fewer frames: all takes less than ten minutes. `--quick` tries everything on almost no data, and keeps
+nothing.
 """
 
 from __future__ import annotations
@@ -15,7 +20,6 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
-import multiprocessing
 import os
 import subprocess
 import sys
@@ -46,30 +50,41 @@ from study.config import (
     FramesSettings,
     PolicySettings,
 )
+from study.engine.cluster import DaskEngine, local_engine
+from study.engine.flows import run_flow
 from study.frames import SHAPES, Frames
-from study.policy import WIDTHS, train_policies
-from study.provenance import provenance
+from study.policy import WIDTHS, TrainedPolicies, join_policies, train_policies
+from study.provenance import cores, provenance
+from study.stages import ENCODER, POLICY, Batch, Flow, Task
 
 RESULT = Path(__file__).parent / "results" / "training.json"
 BATCHES = {"laptop": 128, "paper": 2048}  # of encoders
-FRAMES = {"laptop": (3072, 768), "paper": (4096, 1024)}  # train, test
+FRAMES = {"laptop": (1536, 384), "paper": (4096, 1024)}  # train, test
 EPOCHS = 5  # of ours and of the bare loop; the first is not counted
-PLAIN_EPOCHS = 4
+PLAIN_EPOCHS = 3  # of the template; the first is not counted
+PROBE = 256  # frames on which the processor's speed is tried before
+FAST = 300.0  # images/s of `full` in a bare loop on one core, from which on all frames are used
 POLICY_FRAMES = {"laptop": (10_000, 2_500), "paper": (64_000, 16_000)}
 POLICY_BATCHES = {"laptop": 512, "paper": 2048}
-POLICY_EPOCHS = 5  # of a plain fit; the first is not counted
-STACKED_EPOCHS = {"laptop": 100, "paper": 20}  # of ours, all counted; the paper's are 100, too
-POLICY_ROUNDS = 2
+POLICY_EPOCHS = 4  # of a plain fit; the first is not counted
+STACKED_EPOCHS = {"laptop": 50, "paper": 10}  # of ours, all counted; a study's are 100
+POLICY_ROUNDS = 3
 SEEDS = 15
+WORKERS = 2  # of the engine; as many shares of the seeds
 CPU = torch.device("cpu")
 PACKAGES = ("lightning", "numpy", "torch")
 
 Numbers = dict[str, Any]
 
 
-def spread(values: Iterable[float]) -> Numbers:
-    """Median, lowest and highest."""
+Report = Callable[..., None]
+
+
+def spread(values: Iterable[float]) -> Numbers | None:
+    """Median, lowest and highest; None of nothing."""
     values = sorted(values)
+    if not values:
+        return None
     return {"median": float(np.median(values)), "low": values[0], "high": values[-1], "n": len(values)}
 
 
@@ -86,10 +101,15 @@ def fastest(work: Callable[[], Any], times: int = 8) -> float:
     return min(seconds)
 
 
+def has_bf16() -> bool:
+    """Whether this processor multiplies bf16 matrices itself."""
+    return choose_precision("auto", CPU) == "bf16"
+
+
 def peaks(side: int) -> Numbers:
-    """Multiplications a second in a square matrix product, and bytes a second read and written in a copy."""
-    found = {}
-    for name, kind in (("fp32", torch.float32), ("bf16", torch.bfloat16)):
+    """Multiplications a second in a square matrix product, and bytes a second in a copy, by one thread."""
+    found: Numbers = {"bf16_multiplications_per_s": None}
+    for name, kind in (("fp32", torch.float32), ("bf16", torch.bfloat16))[: 1 + has_bf16()]:
         one, other = torch.rand(side, side).to(kind), torch.rand(side, side).to(kind)
         out = torch.empty_like(one)
         found[f"{name}_multiplications_per_s"] = side**3 / fastest(lambda a=one, b=other, c=out: torch.mm(a, b, out=c))
@@ -201,31 +221,31 @@ def timed_checkpoints() -> Iterator[list[float]]:
         autoencoder._write_checkpoint = write  # noqa: SLF001
 
 
-def turn_about(frames: Frames, heads: str, settings: EncoderSettings, precision: str) -> dict[str, list[float]]:
-    """Seconds an epoch of ours and of the bare loop, and the seconds of ours that went into telling of it."""
+def turn_about(
+    heads: str, frames_of: tuple[int, int], settings: EncoderSettings, report: Report
+) -> dict[str, list[float]]:
+    """Seconds an epoch of ours and of the bare loop, and the seconds of ours that went into reports."""
+    torch.set_num_threads(1)
+    frames, precision = random_frames(*frames_of), choose_precision("auto", CPU)
     bare = bare_epochs(frames, heads, settings, precision)
     next(bare)  # warms up
-    found: dict[str, list[float]] = {"ours": [], "bare": [], "telling": []}
-    here, there = multiprocessing.Pipe(duplex=False)
-    threading.Thread(target=lambda: [None for _ in iter(here.recv, None)], daemon=True).start()
-    begin = told = 0.0
+    found: dict[str, list[float]] = {"ours": [], "bare": [], "reporting": []}
+    begin = reporting = 0.0
 
-    def progress(done: int, whole: int) -> None:
-        nonlocal told
+    def tell(*values: Any) -> None:
+        nonlocal reporting
         start = time.perf_counter()
-        there.send(("progress", "encoder", done, whole))
-        told += time.perf_counter() - start
+        report(*values)
+        reporting += time.perf_counter() - start
 
     def log(epoch: int, losses: dict[str, float]) -> None:
-        nonlocal begin, told
-        start = time.perf_counter()
-        there.send(("log", "encoder", epoch, losses))
-        told += time.perf_counter() - start
+        nonlocal begin, reporting
+        tell("log", epoch, losses)
         if epoch > 1:
             found["ours"].append(time.perf_counter() - begin)
-            found["telling"].append(told)
+            found["reporting"].append(reporting)
             found["bare"].append(next(bare))
-        told, begin = 0.0, time.perf_counter()
+        reporting, begin = 0.0, time.perf_counter()
 
     with tempfile.TemporaryDirectory() as folder, timed_checkpoints() as found["checkpoint"]:
         train_encoder(
@@ -238,13 +258,17 @@ def turn_about(frames: Frames, heads: str, settings: EncoderSettings, precision:
             device="cpu",
             checkpoint=Path(folder) / "checkpoint",
             log=log,
-            progress=progress,
+            progress=lambda done, total: tell("progress", done, total),
         )
-    there.send(None)
     return found
 
 
-def encoder(heads: str, size: str, limits: Numbers) -> Numbers:
+def one_batch(*tasks: Task) -> Flow[list[Any]]:
+    """A flow of one stage."""
+    return (yield Batch(tasks))
+
+
+def encoder(engine: DaskEngine, heads: str, size: str, limits: Numbers) -> Numbers:
     """One head set at one batch size: ours, the bare loop, the template in fp32 and in bf16."""
     batch, (train, test) = BATCHES[size], FRAMES[size]
     frames = random_frames(train, test)
@@ -252,14 +276,17 @@ def encoder(heads: str, size: str, limits: Numbers) -> Numbers:
     settings = EncoderSettings(batch=batch, epochs=EPOCHS)
     steps = plan_training(frames, 1.0, 0, settings, FramesSettings()).steps
     templates = {"template": plain.fit_encoder(frames, heads, batch, PLAIN_EPOCHS, "32-true")}
-    found = turn_about(frames, heads, settings, precision)
-    templates["template_bf16"] = plain.fit_encoder(frames, heads, batch, PLAIN_EPOCHS, "bf16-mixed")
+    task = Task(ENCODER, turn_about, (heads, (train, test), settings), reports=True)
+    (found,) = run_flow(one_batch(task), engine)
+    templates["template_bf16"] = (
+        plain.fit_encoder(frames, heads, batch, PLAIN_EPOCHS, "bf16-mixed") if has_bf16() else []
+    )
     rates = {name: [train / seconds for seconds in found[name]] for name in ("ours", "bare")}
     rates |= {name: [train / seconds for seconds in epochs] for name, epochs in templates.items()}
     pairs = [ours / bare for ours, bare in zip(rates["ours"], rates["bare"], strict=True)]
     limit = floor(encoder_work(heads, 2 if precision == "bf16" else 4), precision, limits)
-    ours = spread(rates["ours"])
-    told = sum(found["telling"]) / sum(found["ours"])
+    ours = float(np.median(rates["ours"]))
+    reporting = sum(found["reporting"]) / sum(found["ours"])
     return {
         "heads": heads,
         "batch": batch,
@@ -268,26 +295,45 @@ def encoder(heads: str, size: str, limits: Numbers) -> Numbers:
         "precision": precision,
         "images_per_s": {name: spread(values) for name, values in rates.items()},
         "ratio_to_bare": spread(pairs),
-        **{f"ratio_to_{name}": ours["median"] / spread(rates[name])["median"] for name in templates},
-        "telling_share": told + float(np.median(found["checkpoint"])) / autoencoder.CHECKPOINT_SECONDS,
+        **{f"ratio_to_{name}": ours / float(np.median(rates[name])) if rates[name] else None for name in templates},
+        "reporting_share": reporting + float(np.median(found["checkpoint"])) / autoencoder.CHECKPOINT_SECONDS,
         "checkpoint_s": spread(found["checkpoint"]),
-        "floor": limit | {"reached": ours["median"] / limit["per_s"]},
+        "floor": limit | {"reached": ours / limit["per_s"]},
     }
+
+
+def use_fewer_frames() -> None:
+    """On a slow processor, shorten the epochs: nobody waits for half an hour."""
+    frames = random_frames(PROBE, PROBE // 4)
+    epochs = bare_epochs(frames, "full", EncoderSettings(batch=BATCHES["laptop"]), choose_precision("auto", CPU))
+    next(epochs)
+    share = min(1.0, PROBE / next(epochs) / FAST)
+    for size, (train, _) in FRAMES.items():
+        steps = max(2 if size == "laptop" else 1, round(share * train / BATCHES[size]))
+        FRAMES[size] = (steps * BATCHES[size], steps * BATCHES[size] // 4)
 
 
 def encoders(limits: Numbers) -> Numbers:
     """All configurations, and the worst of each ratio."""
     found = []
     for size, heads in itertools.product(BATCHES, ("rec", "full")):
-        found.append(encoder(heads, size, limits))
+        with scratch_engine(1) as engine:
+            found.append(encoder(engine, heads, size, limits))
         print(json.dumps(found[-1]), file=sys.stderr)  # it takes minutes: what is measured should not be lost
     return {
         "images_per_s": found[-1]["images_per_s"]["ours"]["median"],  # `full` at the paper's batch
         "ratio_to_bare": min(each["ratio_to_bare"]["median"] for each in found),
         "ratio_to_template": min(each["ratio_to_template"] for each in found),
-        "telling_share": max(each["telling_share"] for each in found),
+        "reporting_share": max(each["reporting_share"] for each in found),
         "configurations": found,
     }
+
+
+@contextmanager
+def scratch_engine(workers: int) -> Iterator[DaskEngine]:
+    """Have an engine on this machine."""
+    with tempfile.TemporaryDirectory() as folder, local_engine(workers, Path(folder)) as engine:
+        yield engine
 
 
 # --- memory ---------------------------------------------------------------------------------------------------------
@@ -340,41 +386,63 @@ def latents(frames: int, seed: int) -> tuple[np.ndarray, pd.DataFrame]:
     return z, pd.DataFrame({"steering": np.tanh(z[:, 0]) / 4, "acceleration": np.digitize(z[:, 1], [-0.5, 0.5])})
 
 
-def seconds_of_an_epoch(train: plain.Labelled, test: plain.Labelled, batch: int, epochs: int) -> float:
-    """Of all seeds, measuring, starting the processes and waiting for the last of them included."""
+def train_share(
+    train: plain.Labelled, test: plain.Labelled, seeds: list[int], settings: PolicySettings, report: Report
+) -> TrainedPolicies:
+    """Train the policies of some seeds, as `study.cell` does."""
+    return train_policies(
+        train[0],
+        test[0],
+        train[1],
+        test[1],
+        seeds,
+        settings,
+        log=lambda epoch, metrics: report("log", epoch, metrics),
+        progress=lambda done, total: report("progress", done, total),
+    )
+
+
+def seconds_of_an_epoch(
+    engine: DaskEngine, train: plain.Labelled, test: plain.Labelled, batch: int, epochs: int
+) -> float:
+    """Of all seeds, in shares: sending, training, measuring, and waiting for the last share included."""
     settings = PolicySettings(epochs=epochs, batch=batch)
+    shares = [part.tolist() for part in np.array_split(np.arange(SEEDS), WORKERS)]
     begin = time.perf_counter()
-    train_policies(train[0], test[0], train[1], test[1], range(SEEDS), settings)
+    tasks = [Task(POLICY, train_share, (train, test, seeds, settings), len(seeds), reports=True) for seeds in shares]
+    join_policies(run_flow(one_batch(*tasks), engine))
     return (time.perf_counter() - begin) / epochs
 
 
-def policies(size: str, limits: Numbers) -> Numbers:
-    """Seconds an epoch of 15 policies, stacked and one after the other, and how many times faster the stack is.
+def policies(engine: DaskEngine, size: str, limits: Numbers) -> Numbers:
+    """Seconds an epoch of 15 policies, in shares and one after the other, and how many times faster the shares are.
 
-    The plain fit is measured with torch's threads as they come, and with one: small products gain little from two.
+    The plain fit is measured with a thread for each core, and with one: small products gain little from two, and lose
+    on a busy machine. The ratio of a round is to the faster of both.
     """
     (frames, tests), batch = POLICY_FRAMES[size], POLICY_BATCHES[size]
     train, test = latents(frames, 0), latents(tests, 1)
-    threads = torch.get_num_threads()
     seconds: dict[str, list[float]] = {"ours": [], "sequential": [], "sequential_one_thread": []}
     ratios = []
+    seconds_of_an_epoch(engine, *(latents(frames, 0) for frames in (batch, 100)), batch, 5)  # workers load libraries
     for _ in range(POLICY_ROUNDS):
+        torch.set_num_threads(cores())
         plain_epochs = [SEEDS * epoch for epoch in plain.fit_policy(train, test, batch, POLICY_EPOCHS)]
-        ours = seconds_of_an_epoch(train, test, batch, STACKED_EPOCHS[size])
         torch.set_num_threads(1)
+        ours = seconds_of_an_epoch(engine, train, test, batch, STACKED_EPOCHS[size])
         one_thread = [SEEDS * epoch for epoch in plain.fit_policy(train, test, batch, POLICY_EPOCHS)]
-        torch.set_num_threads(threads)
-        ratios.append(float(np.median(plain_epochs) / ours))
+        ratios.append(float(min(np.median(plain_epochs), np.median(one_thread)) / ours))
         for name, values in zip(seconds, ([ours], plain_epochs, one_thread), strict=True):
             seconds[name] += values
     limit = floor(policy_work(), "fp32", limits)
     evaluated = 2 * tests * sum(a * b for widths in WIDTHS.values() for a, b in itertools.pairwise(widths))
-    epoch = SEEDS * (frames / limit["per_s"] + evaluated / limits["fp32_multiplications_per_s"])
-    median, one_thread_median = (spread(seconds[name])["median"] for name in ("ours", "sequential_one_thread"))
+    epoch = SEEDS / WORKERS * (frames / limit["per_s"] + evaluated / limits["fp32_multiplications_per_s"])
+    median, one_thread_median = (float(np.median(seconds[name])) for name in ("ours", "sequential_one_thread"))
     return {
         "frames": [frames, tests],
         "batch": batch,
         "seeds": SEEDS,
+        "shares": WORKERS,
         "epochs": STACKED_EPOCHS[size],
         "seconds_per_epoch": {name: spread(values) for name, values in seconds.items()},
         "ratio_to_sequential": spread(ratios),
@@ -392,7 +460,7 @@ def machine() -> Numbers:
     return {
         "cpu": made_by["cpu"],
         "cores": made_by["cores"],
-        "threads": torch.get_num_threads(),
+        "threads": 1,
         "platform": made_by["platform"],
         "python": made_by["python"],
         "packages": {name: made_by["packages"].get(name) for name in PACKAGES},
@@ -404,18 +472,18 @@ def machine() -> Numbers:
 def show(result: Numbers) -> None:
     """Print the tables of `benchmarks/README.md`."""
 
-    def cell(numbers: Numbers) -> str:
-        return f"{numbers['median']:,.0f} ({numbers['low']:,.0f} to {numbers['high']:,.0f})"
+    def cell(numbers: Numbers | None) -> str:
+        return "-" if numbers is None else f"{numbers['median']:,.0f} ({numbers['low']:,.0f} to {numbers['high']:,.0f})"
 
     print("\n| heads, batch | ours | bare loop | template | template bf16 | to bare | to templates | floor | reached |")
     print("|---|---|---|---|---|---|---|---|---|")
     for each in result["encoder"]["configurations"]:
         rates = (cell(numbers) for numbers in each["images_per_s"].values())
-        limit, pairs = each["floor"], each["ratio_to_bare"]
+        limit, pairs, bf16 = each["floor"], each["ratio_to_bare"], each["ratio_to_template_bf16"]
         print(
             f"| `{each['heads']}`, {each['batch']} | {' | '.join(rates)} "
             f"| {pairs['median']:.3f} ({pairs['low']:.3f} to {pairs['high']:.3f}) "
-            f"| {each['ratio_to_template']:.2f} / {each['ratio_to_template_bf16']:.2f} "
+            f"| {each['ratio_to_template']:.2f} / {'-' if bf16 is None else f'{bf16:.2f}'} "
             f"| {limit['per_s']:,.0f} ({limit['bound']}) | {100 * limit['reached']:.0f} % |"
         )
     print("\n| policies | ours | 15 fits | 15 fits, one thread | ratio | floor | reached |")
@@ -430,9 +498,9 @@ def show(result: Numbers) -> None:
             f"/ {each['ratio_to_sequential_one_thread']:.1f} "
             f"| {each['floor']['seconds_per_epoch']:.2f} | {100 * each['floor']['reached']:.0f} % |"
         )
-    shown = ("machine", "limits", "memory_bytes")
+    shown = ("machine", "limits", "memory_bytes", "skipped", "seconds")
     print(json.dumps({name: result[name] for name in shown}, indent=1))
-    print(f"telling and checkpoints: {100 * result['encoder']['telling_share']:.2f} % at most")
+    print(f"reports and checkpoints: {100 * result['encoder']['reporting_share']:.2f} % at most")
 
 
 def main() -> None:
@@ -450,15 +518,27 @@ def main() -> None:
     if options.memory:
         train_for_memory(options.memory)
         return
+    began = time.monotonic()
+    torch.set_num_threads(1)
     if options.policies:
         result: Numbers = json.loads(RESULT.read_text())
     else:
         result = {"machine": machine(), "limits": peaks(256 if options.quick else 2048)}
+        result["skipped"] = [] if has_bf16() else ["all of bf16: this processor does not multiply bf16 matrices itself"]
+        for reason in result["skipped"]:
+            print(f"left out: {reason}", file=sys.stderr)
+        if not options.quick:
+            use_fewer_frames()
         result["encoder"] = encoders(result["limits"])
-        result["memory_bytes"] = {precision: memory(precision) for precision in ("bf16", "fp32")}
-    sizes = {size: policies(size, result["limits"]) for size in POLICY_FRAMES}
+        result["memory_bytes"] = {"bf16": memory("bf16") if has_bf16() else None, "fp32": memory("fp32")}
+    with scratch_engine(WORKERS) as engine:
+        sizes = {size: policies(engine, size, result["limits"]) for size in POLICY_FRAMES}
     worst = min(each["ratio_to_sequential"]["median"] for each in sizes.values())
-    result["policies"] = {"ratio_to_sequential": worst, "commit": machine()["commit"], **sizes}
+    measured = machine()
+    told = {name: measured[name] for name in ("cpu", "commit", "load_before")}  # of --policies, too
+    result["policies"] = {"ratio_to_sequential": worst, **told, **sizes}
+    if not options.policies:
+        result["seconds"] = round(time.monotonic() - began, 1)
     result["gpu"] = None  # not measured yet
     show(result)
     if not options.quick:
