@@ -25,7 +25,7 @@ from study.engine.flows import run_flow
 from study.frames import Frames, FrameStore, open_frames
 from study.products import Arrays, read_product, write_product
 from study.provenance import provenance
-from study.result import NO_SEED, CellJob, CellResult
+from study.result import CURVE_COLUMNS, NO_SEED, CellJob, CellResult
 from study.stages import ENCODER, LATENTS, POLICY, RESULT, Batch, Flow, Task, Work
 
 PROBED = ("speed", "light", "lead_gap")  # columns of the labels that reports probe the latents for
@@ -196,7 +196,8 @@ def assemble_result(
         ]
     )
     encoder_curves = joined.curves[ENCODER_CURVES][:0] if encoder is None else encoder.curves
-    curves = pd.concat([encoder_curves.assign(policy_seed=NO_SEED, stage="encoder"), joined.curves], ignore_index=True)
+    encoder_curves = encoder_curves.assign(policy_seed=NO_SEED, stage="encoder")
+    curves = pd.concat([encoder_curves, joined.curves], ignore_index=True)[list(CURVE_COLUMNS)]
     labels, first = latents.labels_test, (encoder or latents).facts
     seconds: dict[str, float] = {
         "encoder": encoder.facts["seconds"] if encoder else 0.0,

@@ -1,4 +1,4 @@
-"""Cells trained into a folder, on a machine without tracker, queue and simulator, and taken from there to MLflow."""
+"""Cells trained into a folder, on a machine without MLflow, Optuna, Dask and simulator, and taken from there to MLflow."""
 
 import fcntl
 import os
@@ -29,7 +29,7 @@ PLAN = [*SWEEP, *SETTINGS]
 # What the GPU machine lacks is gone for imports and for those who ask what is installed, in child processes, too.
 REFUSAL = """
 import importlib.metadata as metadata, sys
-GONE = {"mlflow", "optuna", "highway_env", "gymnasium", "typst", "rich", "matplotlib", "sqlalchemy", "PIL", "pillow"}
+GONE = {"mlflow", "optuna", "dask", "distributed", "highway_env", "gymnasium", "typst", "rich", "matplotlib", "sqlalchemy", "PIL", "pillow"}
 class Refusal:
     def find_spec(self, name, path=None, target=None):
         if name.partition(".")[0] in GONE:
@@ -76,7 +76,7 @@ def home(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def results(home):
-    """Results of processes that have no tracker, no queue and no simulator."""
+    """Results of processes that have no tracker, no engine but their own process, and no simulator."""
     refusal = home.with_name("refusal")
     refusal.mkdir()
     (refusal / "sitecustomize.py").write_text(REFUSAL)
@@ -85,7 +85,7 @@ def results(home):
 
 
 @pytest.mark.slow
-def test_cells_are_trained_where_tracker_queue_and_simulator_are_missing(results):
+def test_cells_are_trained_where_tracker_dask_and_simulator_are_missing(results):
     assert {result.key: result.cell for result in load_results(results)} == plan().cells
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import ipaddress
 import logging
 import os
+import pickle
 import signal
 import time
 import uuid
@@ -21,6 +22,7 @@ from queue import Empty, SimpleQueue
 from typing import Any, Self
 from urllib.parse import urlsplit
 
+import cloudpickle  # comes with dask
 import dask
 from distributed import (
     CancelledError,
@@ -89,7 +91,8 @@ class DaskEngine:
         if time.monotonic() - self._looked > SIZE or not self._slots:
             with self._lost():
                 workers = self._client.scheduler_info(n_workers=-1)["workers"].values()
-            self._gpus = int(sum(worker["resources"].get(GPU, 0) for worker in workers))
+            # Never fewer than there were: while a GPU's worker restarts, its tasks must not go to a CPU.
+            self._gpus = max(self._gpus, int(sum(worker["resources"].get(GPU, 0) for worker in workers)))
             # A worker with a GPU trains there, and leaves the rest to the others where there are any.
             plain = sum(worker["nthreads"] for worker in workers if not worker["resources"].get(GPU))
             self._slots = plain or sum(worker["nthreads"] for worker in workers)
@@ -101,7 +104,7 @@ class DaskEngine:
         return self._slots
 
     def gpus(self) -> int:
-        """Return how many GPUs the workers have, just now."""
+        """Return how many GPUs the workers have had at most."""
         self._look()
         return self._gpus
 
@@ -114,10 +117,8 @@ class DaskEngine:
         """Hand the task to the scheduler."""
         with self._lost():
             future = self._client.submit(
-                _run_on_worker,
-                self._topic,
-                number,
-                task,
+                _UNPACKED,
+                cloudpickle.dumps(partial(_run_on_worker, self._topic, number, task)),
                 key=f"{task.stage.name}-{uuid.uuid4().hex}",
                 pure=False,
                 priority=-number,
@@ -171,6 +172,11 @@ class DaskEngine:
             f"the scheduler at {self._address} went away; nothing that was finished is lost: start it again, with its "
             "workers, and give the same command"
         )
+
+
+# A lambda travels by value: the scheduler needs none of this program, and a worker that lacks a part of it says so in
+# the task's failure. A task that Dask itself unpacked there would end the worker, and its flow would wait for ever.
+_UNPACKED = lambda packed: pickle.loads(packed)()  # noqa: E731, S301
 
 
 def _run_on_worker(topic: str, number: int, task: Task) -> Any:
