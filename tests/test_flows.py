@@ -7,7 +7,7 @@ from collections import deque
 import pytest
 
 from study.config import BadInputError, TrainingDivergedError
-from study.engine.flows import TRIES, FlowFailedError, SilentListener, run_flow, run_flows
+from study.engine.flows import TRIES, FlowFailedError, Listener, run_flow, run_flows
 from study.engine.tasks import perform
 from study.stages import ENCODER, LATENTS, POLICY, Batch, Task
 
@@ -47,7 +47,7 @@ class Machine:
         return [(number, perform(task, lambda *values: hear(number, *values)))]
 
 
-class Heard(SilentListener):
+class Heard:
     """Notes all events of one kind or another."""
 
     def __init__(self):
@@ -56,8 +56,8 @@ class Heard(SilentListener):
     def started(self, name, host, process):
         self.starts.append((name, host, process))
 
-    def progress(self, name, batch, done, total):
-        self.steps.append((batch.tasks[0].stage.name, done, total))
+    def progress(self, name, stage, done, total):
+        self.steps.append((stage, done, total))
 
     def log(self, name, stage, epoch, metrics):
         self.logs.append((name, stage, epoch, metrics))
@@ -75,7 +75,8 @@ class Heard(SilentListener):
 def run(flows, engine=None):
     """What a listener heard of these flows, by name."""
     heard, left = Heard(), iter(list(flows.items()))
-    run_flows(engine or Machine(), lambda: next(left, None), heard)
+    listener = Listener(heard.finished, heard.failed, heard.progress, heard.started, log=heard.log, retry=heard.retry)
+    run_flows(engine or Machine(), lambda: next(left, None), listener)
     return heard
 
 

@@ -3,7 +3,7 @@
 import pytest
 
 from study.config import Cell, StudySettings
-from study.stages import Cost, cell_cost, clock, data_cost, size, total
+from study.stages import CELL_STAGES, DATA_STAGES, Cost, Work, cell_cost, clock, data_cost, share_done, size, total
 
 
 def changed(**groups):
@@ -41,3 +41,20 @@ def test_times_read_well(seconds, text):
 @pytest.mark.parametrize(("count", "text"), [(310e6, "310 MB"), (7e9, "7.0 GB")])
 def test_sizes_read_well(count, text):
     assert size(count) == text
+
+
+@pytest.mark.parametrize("stages", [CELL_STAGES, DATA_STAGES], ids=["cell", "data"])
+@pytest.mark.parametrize("heads", ["rec", "full", "state"])
+def test_the_share_that_is_done_grows_from_nothing_to_all(stages, heads):
+    work = Work(StudySettings(), Cell(heads=heads), 15)
+    shares = [share_done(stages, work, stage, done) for stage in stages for done in (0.0, 0.5, 1.0)]
+    assert shares[0] == 0
+    assert shares[-1] == pytest.approx(1)
+    assert shares == sorted(shares)
+    for end, begin in zip(shares[2::3], shares[3::3], strict=False):
+        assert end == pytest.approx(begin)  # one stage ends where the next begins
+
+
+def test_a_cell_without_an_encoder_spends_no_time_on_one():
+    work = Work(StudySettings(), Cell(heads="state"), 15)
+    assert share_done(CELL_STAGES, work, CELL_STAGES[0], 1.0) == 0

@@ -9,6 +9,7 @@ from __future__ import annotations
 import ipaddress
 import logging
 import os
+import pickle
 import signal
 import sys
 import time
@@ -22,6 +23,7 @@ from queue import Empty, SimpleQueue
 from typing import Any, Self
 from urllib.parse import urlsplit
 
+import cloudpickle  # comes with dask
 import dask
 from distributed import (
     CancelledError,
@@ -95,7 +97,8 @@ class DaskEngine:
             if workers is None:
                 raise self._gone()
             workers = workers.values()
-            self._gpus = int(sum(worker["resources"].get(GPU, 0) for worker in workers))
+            # Never fewer than there were: while a GPU's worker restarts, its tasks must not go to a CPU.
+            self._gpus = max(self._gpus, int(sum(worker["resources"].get(GPU, 0) for worker in workers)))
             # A worker with a GPU trains there, and leaves the rest to the others where there are any.
             plain = sum(worker["nthreads"] for worker in workers if not worker["resources"].get(GPU))
             self._slots = plain or sum(worker["nthreads"] for worker in workers)
@@ -107,7 +110,7 @@ class DaskEngine:
         return max(1, self._slots)
 
     def gpus(self) -> int:
-        """Return how many GPUs the workers have, just now."""
+        """Return how many GPUs the workers have had at most."""
         self._look()
         return self._gpus
 
@@ -128,10 +131,8 @@ class DaskEngine:
         """Hand the task to the scheduler."""
         with self._lost():
             future = self._client.submit(
-                _run_on_worker,
-                self._topic,
-                number,
-                task,
+                _UNPACKED,
+                cloudpickle.dumps(partial(_run_on_worker, self._topic, number, task)),
                 key=f"{task.stage.name}-{uuid.uuid4().hex}",
                 pure=False,
                 priority=-number,
@@ -189,6 +190,11 @@ class DaskEngine:
 
 class _UnwantedError(RuntimeError):
     """Nobody waits for this task any more: its flow has failed, or its client or scheduler is gone."""
+
+
+# A lambda travels by value: the scheduler needs none of this program, and a worker that lacks a part of it says so in
+# the task's failure. A task that Dask itself unpacked there would end the worker, and its flow would wait for ever.
+_UNPACKED = lambda packed: pickle.loads(packed)()  # noqa: E731, S301
 
 
 def _run_on_worker(topic: str, number: int, task: Task) -> Any:

@@ -1,0 +1,132 @@
+"""The main path of a cell: shares change nothing, finished stages are kept, and damage to them is mended."""
+
+import dataclasses
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from study import cell as path
+from study.cell import cell_flow, product_folders
+from study.config import BadInputError, Cell, cell_key, load_profile
+from study.engine.flows import run_flow
+from study.frames import open_frames
+from study.job import CellJob
+from study.result import ARRAYS, CURVE_COLUMNS
+
+SETTINGS = load_profile("smoke", {"encoder": {"epochs": 2, "batch": 16}, "policy": {"epochs": 5, "batch": 16}})
+REC, CEILING = Cell(heads="rec"), Cell(heads="state")
+SEEDS = 3
+
+
+@pytest.fixture
+def new_job(small_store, small_drives, tmp_path):
+    """What training a cell on the small frames needs, in a scratch folder of its own."""
+
+    def make(cell=REC, **changes):
+        key = cell_key(SETTINGS, cell, SEEDS, open_frames(small_store).key)
+        job = CellJob(cell, key, SETTINGS, SEEDS, small_store, small_drives[0].parent, tmp_path / "scratch", "cpu")
+        return dataclasses.replace(job, **changes)
+
+    return make
+
+
+def run(job, **how):
+    """The result, the network, and the stages that told of progress."""
+    stages = []
+    result, network = run_flow(cell_flow(job, **how), progress=lambda stage, *_: stages.append(stage))
+    return result, network, list(dict.fromkeys(stages))
+
+
+def assert_same(one, other):
+    assert (one.cell, one.key, one.settings) == (other.cell, other.key, other.settings)
+    pd.testing.assert_frame_equal(one.curves, other.curves, check_exact=True)
+    for part in ARRAYS:
+        ours, theirs = getattr(one, part), getattr(other, part)
+        assert ours.keys() == theirs.keys()
+        for name, array in ours.items():
+            assert array.dtype == theirs[name].dtype
+            assert array.tobytes() == theirs[name].tobytes(), name
+
+
+@pytest.fixture
+def many_shares(monkeypatch):
+    """Each policy seed is worth a share."""
+    monkeypatch.setattr(path, "SHARE_SECONDS", 1e-9)
+
+
+def test_policies_in_shares_give_the_result_of_one_share(new_job, tmp_path, many_shares):
+    once, network, _ = run(new_job(scratch=tmp_path / "once"), one_share=True)
+    shared, again, stages = run(new_job())
+    assert len(product_folders(tmp_path / "once", once.key)) == 1
+    assert len(product_folders(tmp_path / "scratch", once.key)) == SEEDS
+    assert stages == ["encoder", "latents", "policy", "result"]
+    assert_same(once, shared)
+    assert network
+    assert again
+    assert list(shared.curves.columns) == list(CURVE_COLUMNS)
+    assert sorted(shared.curves["policy_seed"].unique()) == [-1, 0, 1, 2]
+
+
+def test_products_of_finished_stages_are_not_made_again(new_job):
+    job = new_job()
+    first, _, _ = run(job)
+    second, _, stages = run(job)
+    assert stages == ["latents", "result"]
+    assert_same(first, second)
+
+
+def test_only_what_is_missing_or_damaged_is_made_again_and_is_what_it_was(new_job, many_shares):
+    job = new_job()
+    first, _, _ = run(job)
+    weights = sorted(product_folders(job.scratch, job.key))[1] / "weights.safetensors"
+    content = bytearray(weights.read_bytes())
+    weights.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    told = []
+    second, _ = run_flow(cell_flow(job), progress=lambda *how: told.append(how))
+    epochs = SETTINGS.policy.epochs
+    assert next(how for how in told if how[0] == "policy") == ("policy", 2, 3)
+    assert [how for how in told if how[0] == "policy"][-1] == ("policy", epochs, epochs)
+    assert "encoder" not in {how[0] for how in told}
+    assert_same(first, second)
+    assert weights.read_bytes() == content
+
+
+def test_the_ceiling_has_neither_encoder_nor_network(new_job, small_drives):
+    """Its latents are the true state of the drives behind the policy set."""
+    result, network, stages = run(new_job(CEILING, drives=small_drives[3].parent))
+    assert stages == ["latents", "policy", "result"]
+    assert (network, result.encoder, result.samples) == (b"", {}, {})
+    assert set(result.curves["stage"]) == {"policy"}
+    assert result.facts["seconds"]["encoder"] == 0
+    assert np.isfinite(result.curves["value"]).all()
+
+
+def test_facts_say_what_computed(new_job):
+    result, _, _ = run(new_job(threads=1))
+    facts = result.facts
+    assert (facts["device"], facts["threads"]) == ("CPU", 1)
+    assert facts["frames"]["policy_train"] + facts["frames"]["policy_test"] == 40
+    assert facts["seconds"]["cell"] == pytest.approx(
+        sum(facts["seconds"][name] for name in ("encoder", "encode", "policies"))
+    )
+    assert facts["peak_bytes"] > 1e7
+    assert facts["provenance"]["seeds"]["policies"] == list(range(SEEDS))
+
+
+def test_frames_of_another_plan_are_refused(new_job):
+    with pytest.raises(BadInputError, match="is not the frame store that rec 100% e0 was planned on"):
+        run(new_job(key="0" * 16))
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU is there")
+@pytest.mark.parametrize("device", ["cuda", "cuda:0", "cuda:1"])
+def test_a_gpu_that_is_not_there_is_refused_and_never_replaced_by_the_cpu(new_job, device):
+    with pytest.raises(BadInputError, match="choose from cpu"):
+        run(new_job(device=device))
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU is there")
+def test_without_a_gpu_auto_is_the_cpu(new_job):
+    assert run(new_job(device="auto"))[0].facts["device"] == "CPU"
