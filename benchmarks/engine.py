@@ -3,8 +3,8 @@
 Measured: the import of Dask in a new process; the start of two workers to the first result, and their end; a worker's
 import of what stages compute with; empty tasks, one after the other and many at once; a task with the latents of a
 laptop cell; a report from a task; and in MLflow, on SQLite, the opening and closing of a sweep, and for each cell its
-start, its live curves and its commit. The result that is committed is real: an encoder of `rec` and 15 policies with
-the epochs of `laptop`, trained on the frames of `smoke`.
+start, a write of its live curves and its commit. The result that is committed is real: an encoder of `rec` and 15
+policies with the epochs of `laptop`, trained on the frames of `smoke`.
 
 From these follows the share of a laptop `heads`: what all its tasks, reports and cells take, over what its stages are
 expected to take (`study.stages`). That is an upper bound: the client works while the workers compute, and is counted as
@@ -40,7 +40,7 @@ from study.stages import ENCODER, POLICY, RESULT, Batch, Flow, Task, cell_cost
 
 RESULT_FILE = Path(__file__).parent / "results" / "engine.json"
 WORKERS = 2
-STARTS, SINGLE, MANY, REPORTS, CELLS = 5, 50, 400, 2000, 8
+STARTS, SINGLE, MANY, REPORTS, CELLS, LIVE = 5, 50, 400, 2000, 8, 20
 REPORT_EVERY = 0.25  # [s] between two reports of an encoder's progress
 PACKAGES = ("distributed", "mlflow", "optuna", "numpy", "torch")
 IMPORT = "import time; t = time.perf_counter(); import study.engine.cluster; print(time.perf_counter() - t)"
@@ -138,7 +138,7 @@ def measure_tracking(plan: Plan, result: CellResult, network: bytes) -> Numbers:
     from study.tracking import Tracker  # noqa: PLC0415
 
     keys = {f"{number:016x}": result.cell for number in range(CELLS)}
-    found: dict[str, list[float]] = {"cell_start_s": [], "cell_live_s": [], "cell_commit_s": [], "cell_trial_s": []}
+    found: dict[str, list[float]] = {"cell_start_s": [], "live_write_s": [], "cell_commit_s": [], "cell_trial_s": []}
     times: list[float] = [time.perf_counter()]
     tracker = Tracker("sqlite:///mlruns/mlflow.db")
     times.append(time.perf_counter())
@@ -146,7 +146,6 @@ def measure_tracking(plan: Plan, result: CellResult, network: bytes) -> Numbers:
     times.append(time.perf_counter())
     trials = Trials(Path("mlruns/optuna.db"), "benchmark", {key: cell.label for key, cell in keys.items()}, keys)
     times.append(time.perf_counter())
-    epochs = {"encoder": plan.settings.encoder.epochs, "policy": plan.settings.policy.epochs}
     metrics = {f"{split}/metric{number}": 0.5 for split in ("train", "test") for number in range(4)}
     for key, cell in keys.items():
         begin = time.perf_counter()
@@ -154,12 +153,11 @@ def measure_tracking(plan: Plan, result: CellResult, network: bytes) -> Numbers:
         middle = time.perf_counter()
         run = tracker.start_cell(sweep, cell, key, plan.settings, plan.grid.policy_seeds)
         started = time.perf_counter()
-        for stage, count in epochs.items():
-            for epoch in range(1, count + 1):
+        for epoch in range(1, LIVE + 1):
+            for stage in ("encoder", "policy"):
                 run.log(stage, epoch, metrics)
-                run.progress(stage, epoch, count)
-        run.stop()
-        run._flush()  # noqa: SLF001 - what the thread of the run writes meanwhile, here at once
+                run.note(progress=f"{stage} {epoch}/{LIVE}")
+            found["live_write_s"].append(seconds(run.flush))
         live = time.perf_counter()
         tracker.commit(run, replace(result, key=key), network)
         committed = time.perf_counter()
@@ -167,7 +165,6 @@ def measure_tracking(plan: Plan, result: CellResult, network: bytes) -> Numbers:
         end = time.perf_counter()
         for name, value in (
             ("cell_start_s", started - middle),
-            ("cell_live_s", live - started),
             ("cell_commit_s", committed - live),
             ("cell_trial_s", middle - begin + end - committed),
         ):
@@ -182,6 +179,8 @@ def measure_tracking(plan: Plan, result: CellResult, network: bytes) -> Numbers:
 
 def count_work(plan: Plan) -> Numbers:
     """Tasks, reports and cells of a sweep, and the seconds that its stages are expected to take."""
+    from study.tracking import FLUSH, SIGN  # noqa: PLC0415 - as above
+
     recording = plan.settings.recording
     drives = recording.encoder_episodes + recording.policy_episodes
     shares = {key: -(-2 * POLICY.cost(work) // SHARE_SECONDS) for key, work in plan.works.items()}
@@ -189,11 +188,14 @@ def count_work(plan: Plan) -> Numbers:
         cell_cost(plan.settings, cell, plan.grid.policy_seeds).seconds for cell in plan.cells.values()
     )
     encoders = sum(ENCODER.cost(work) for work in plan.works.values())
+    policies = sum(POLICY.cost(work) for work in plan.works.values())
     return {
         "cells": len(plan.cells),
         # Recording, choosing and rendering each drive, and the card; encoder, latents, result and the policies' shares.
         "tasks": 3 * drives + 1 + 3 * len(plan.cells) + int(sum(shares.values())),
         "shares": int(sum(shares.values())),
+        # On one core each takes twice as long.
+        "live_writes": int(2 * encoders / SIGN + 2 * policies / FLUSH),
         "reports": int(2 * encoders / REPORT_EVERY + 2 * plan.settings.policy.epochs * sum(shares.values())),
         "expected_s": expected,
     }
@@ -206,14 +208,16 @@ def overhead(counts: Numbers, measured: Numbers) -> Numbers:
         value = measured[name]
         return float(value["median"] if isinstance(value, dict) else value)
 
-    cells = ("cell_start_s", "cell_live_s", "cell_commit_s", "cell_trial_s")
+    cells = ("cell_start_s", "cell_commit_s", "cell_trial_s")
     once = ("open_store_s", "open_sweep_s", "open_trials_s", "close_sweep_s")
     parts = {
         "start": median("import_s") + median("start_s") + median("worker_import_s") + median("end_s"),
         "tasks": counts["tasks"] * median("single_task_s")
         + counts["shares"] * (median("task_with_latents_s") - median("single_task_s")),
         "reports": counts["reports"] * median("report_s"),
-        "tracking": sum(map(median, once)) + counts["cells"] * sum(map(median, cells)),
+        "tracking": sum(map(median, once))
+        + counts["cells"] * sum(map(median, cells))
+        + counts["live_writes"] * median("live_write_s"),
     }
     total = sum(parts.values())
     return {"seconds": parts | {"total": total}, "share": total / counts["expected_s"]}

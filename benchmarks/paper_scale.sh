@@ -15,13 +15,15 @@ train   renders the frames and trains the cells for at most SECONDS (default 540
         Copy FOLDER/results back then, into FOLDER.
 import  commits the results to MLflow and writes the report, in the working folder it is called from.
 
-The GPU machine needs Python with torch, lightning, numpy, pandas, pyarrow and OpenCV; nothing is fetched there.
+The GPU machine needs Python with torch, lightning, numpy, pandas, pyarrow and OpenCV; nothing is fetched there. With Dask
+all its cores and GPUs are used, without it cells are trained one after the other on one GPU.
 Environment, of pack unless said otherwise:
   PYTHON   the Python to use (all steps; default: .venv/bin/python beside the code, else python3)
   SWEEP    the sweep, with options of its grid if need be (default: heads)
   THERE    version of the GPU machine's Python, x86-64 (default: 3.12)
   WHEELS   packages that the GPU machine lacks, as in requirements.lock (default: pydantic and its needs, pyyaml,
-           safetensors; "" for none)
+           safetensors, filelock; "" for none)
+  DASK     no (default), or yes: then Dask's wheels (5 MB) travel, too
   RECORD   here (default), or there: then the simulator's wheels (15 MB) travel instead of the drives (0.6 GB), and the
            GPU machine needs matplotlib and scipy
 END
@@ -38,7 +40,9 @@ pack() {
   shift
   [ $# -gt 0 ] || set -- --profile paper
   read -ra grid <<< "${SWEEP:-heads}"
-  local wheels=${WHEELS-pydantic pydantic-core annotated-types typing-inspection typing-extensions pyyaml safetensors}
+  local wheels=${WHEELS-pydantic pydantic-core annotated-types typing-inspection typing-extensions pyyaml safetensors filelock}
+  [ "${DASK:-no}" = no ] || wheels+=" distributed dask click cloudpickle fsspec jinja2 markupsafe locket msgpack packaging \
+    partd psutil sortedcontainers tblib toolz tornado zict"
   [ "$record" = here ] || wheels+=" highway-env gymnasium farama-notifications cloudpickle pygame-ce"
   mkdir -p "$folder/wheels"
   git -C "$root" archive HEAD study sweeps benchmarks requirements.lock .git_archival.txt | tar -x -C "$folder"

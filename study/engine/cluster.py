@@ -70,9 +70,11 @@ class EngineLostError(BadInputError):
 class DaskEngine:
     """Runs tasks on the workers of a Dask scheduler."""
 
-    def __init__(self, client: Client, close: Callable[[], None], address: str) -> None:
-        """Take a connected client; `close` ends what was started for it."""
-        self._client, self._close, self._address = client, close, address
+    def __init__(
+        self, client: Client, close: Callable[[], None], address: str, renew: Callable[[], object] | None = None
+    ) -> None:
+        """Take a connected client; `close` ends what was started for it, `renew` replaces workers that were lost."""
+        self._client, self._close, self._address, self._renew = client, close, address, renew
         self._topic = f"study-{uuid.uuid4().hex}"
         self._futures: dict[int, Future[Any]] = {}
         self._messages: SimpleQueue[tuple[str, int, Any]] = SimpleQueue()
@@ -103,6 +105,8 @@ class DaskEngine:
             plain = sum(worker["nthreads"] for worker in workers if not worker["resources"].get(GPU))
             self._slots = plain or sum(worker["nthreads"] for worker in workers)
             self._looked = time.monotonic()
+            if self._renew:
+                self._renew()
 
     def slots(self) -> int:
         """Return how many tasks can run at a time, just now; 1 while the cluster has no worker, which waits for it."""
@@ -398,7 +402,9 @@ def start_jobs(kind: Callable[..., Any], arguments: Mapping[str, Any], workers: 
     except (OSError, TypeError, ValueError, RuntimeError, ImportError) as error:
         reason = " ".join(str(error).split())[:300]
         raise BadInputError(f"{source}: {kind.__name__} cannot be started with these arguments: {reason}") from None
-    return DaskEngine(client, partial(_close, client, cluster), cluster.scheduler_address)
+    # A job whose time is up, or whose machine has failed, is asked for again when the cluster is scaled the next time.
+    renew = partial(cluster.scale, workers)
+    return DaskEngine(client, partial(_close, client, cluster), cluster.scheduler_address, renew)
 
 
 def visible_gpus(device: str) -> list[str]:
