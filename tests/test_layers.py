@@ -6,13 +6,13 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 LAYERS = [
-    {"config", "provenance"},
+    {"config", "provenance", "atomic"},
     {"command", "stages", "products", "episode"},
     {"engine"},
     {"birdview", "sim"},
     {"selection", "adapt"},
     {"frames", "imported", "state", "fitting"},
-    {"result"},
+    {"result", "job"},
     {"autoencoder", "policy", "stats"},
     {"exported", "claims", "points", "store", "view"},
     {"mlmodel", "confounds"},
