@@ -1,30 +1,22 @@
-"""Real servers for tests, on loopback only: PostgreSQL with a random port and password, and MLflow's tracking server.
-
-Each can be stopped and started again at the same address. As root, PostgreSQL runs as another user, since it refuses
-to be root.
-"""
+"""Real servers for tests, on loopback only: MLflow's tracking server, which can be stopped and started again."""
 
 from __future__ import annotations
 
 import http.client
 import os
-import secrets
 import shutil
 import signal
 import socket
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import psycopg
 import pytest
 
 LOOPBACK = "127.0.0.1"
 PATIENCE = 300.0  # [s] for a server to answer; MLflow makes its tables first, and a busy machine is slow
-PROGRAMS = Path("/usr/lib/postgresql")  # where Debian keeps them, off the PATH
 
 
 def free_port() -> int:
@@ -42,108 +34,6 @@ def _await(process: subprocess.Popen[bytes], answers: Callable[[], bool], log: P
             return
         time.sleep(0.1)
     raise RuntimeError(f"the server did not start:\n{log.read_text(errors='replace')[-4000:]}")
-
-
-# --- PostgreSQL -----------------------------------------------------------------------------------------------------
-
-
-def _programs() -> Path | None:
-    found = shutil.which("postgres")
-    folders = [*sorted(PROGRAMS.glob("*/bin"), key=lambda at: int(at.parent.name), reverse=True)]
-    folders += [Path(found).resolve().parent] if found else []
-    return next((folder for folder in folders if (folder / "initdb").is_file()), None)
-
-
-class PostgreSQL:
-    """A PostgreSQL server of its own; `uri()` is a new, empty database in it."""
-
-    def __init__(self, programs: Path) -> None:
-        self.port, self.password = free_port(), secrets.token_urlsafe(12)
-        self._programs, self._process = programs, None
-        self._user = {"user": "postgres", "group": "postgres", "extra_groups": []} if os.geteuid() == 0 else {}
-        # Not below pytest's folders, which another user may not enter.
-        self._folder = Path(tempfile.mkdtemp(prefix="study-postgres-"))
-        self._log = self._folder / "log"
-        secret = self._folder / "password"
-        secret.write_text(self.password)
-        if self._user:
-            for path in (self._folder, secret):
-                shutil.chown(path, "postgres", "postgres")
-        words = ["--pgdata", str(self._folder / "data"), "--username", "study", "--encoding", "UTF8", "--no-sync"]
-        words += ["--auth", "scram-sha-256", "--pwfile", str(secret)]
-        subprocess.run([programs / "initdb", *words], cwd=self._folder, check=True, capture_output=True, **self._user)
-        self.start()
-
-    def start(self) -> None:
-        """Start it, again at the same port."""
-        settings = {
-            "listen_addresses": LOOPBACK,
-            "port": self.port,
-            "unix_socket_directories": "",
-            "fsync": "off",  # nobody pulls the plug of a test
-        }
-        words = [part for name, value in settings.items() for part in ("-c", f"{name}={value}")]
-        with self._log.open("ab") as log:
-            self._process = subprocess.Popen(
-                [self._programs / "postgres", "-D", self._folder / "data", *words],
-                cwd=self._folder,
-                stdout=log,
-                stderr=log,
-                **self._user,
-            )
-        _await(self._process, self._answers, self._log)
-
-    def _answers(self) -> bool:
-        try:
-            self._do("select 1")
-        except psycopg.OperationalError:
-            return False
-        return True
-
-    def _do(self, statement: str) -> None:
-        with psycopg.connect(self._address("postgres"), connect_timeout=5, autocommit=True) as connection:
-            connection.execute(statement)
-
-    def _address(self, database: str) -> str:
-        return f"postgresql://study:{self.password}@{LOOPBACK}:{self.port}/{database}"
-
-    def uri(self) -> str:
-        """URI of a new database, with user and password."""
-        name = f"d{secrets.token_hex(6)}"
-        self._do(f"create database {name}")
-        return self._address(name)
-
-    def stop(self) -> None:
-        """Stop it as a reboot would: connections are cut off, what was committed stays."""
-        if self._process is not None:
-            self._process.send_signal(signal.SIGINT)  # PostgreSQL's fast shutdown
-            self._process.wait(30)
-            self._process = None
-
-    def remove(self) -> None:
-        """Stop it for good."""
-        self.stop()
-        shutil.rmtree(self._folder)
-
-
-@pytest.fixture(scope="session")
-def postgres() -> Iterator[PostgreSQL]:
-    """One PostgreSQL server for the whole run; who stops it starts it again."""
-    programs = _programs()
-    if programs is None:
-        message = "PostgreSQL's programs are not on this machine (Debian: apt install postgresql)"
-        if os.environ.get("CI"):
-            pytest.fail(message)
-        pytest.skip(message)
-    server = PostgreSQL(programs)
-    yield server
-    server.remove()
-
-
-@pytest.fixture
-def database(postgres: PostgreSQL) -> str:
-    """URI of a new, empty PostgreSQL database."""
-    return postgres.uri()
 
 
 # --- MLflow ---------------------------------------------------------------------------------------------------------
@@ -208,7 +98,7 @@ class TrackingServer:
 
 @pytest.fixture
 def tracking_server(tmp_path: Path, empty_store: Path) -> Iterator[TrackingServer]:
-    """An MLflow server of its own on SQLite; who needs its store in PostgreSQL makes a TrackingServer."""
+    """An MLflow server of its own on SQLite."""
     (tmp_path / "tracking").mkdir()
     shutil.copy(empty_store, tmp_path / "tracking")
     server = TrackingServer(tmp_path / "tracking")
