@@ -15,14 +15,14 @@ import importlib.util
 import shutil
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from filelock import FileLock, Timeout
 
-from study.cell import cell_flow, product_folders
 from study.command import EXIT_AGAIN, EXIT_FAILED, Parser, run, stoppable, typed
 from study.config import BadInputError
 from study.data import DATA, data_flow
@@ -86,13 +86,16 @@ def train(plan: Plan, out: Path, options: argparse.Namespace) -> int:
     data_seconds = 0.0 if (plan.frames / "manifest.json").is_file() else plan.data_cost.seconds
     if not jobs:
         return 0
-    DATA.mkdir(exist_ok=True)
     _check_installed()
+    from study.cell import cell_flow, product_folders  # noqa: PLC0415 - what it computes with may be missing
+
+    DATA.mkdir(exist_ok=True)
     title = f"{plan.grid.name} ({plan.profile})"
     with Display(title, costs, labels, data_seconds, plan.works) as display, _engine(options) as engine:
         run_flow(data_flow(plan.settings, DATA, plan.imported), engine, display.data)
         shutil.copyfile(plan.frames / "manifest.json", out / f"frames-{plan.frames.name}.json")
-        saving = _Saving(out, jobs, display, one_share=engine.gpus() > 0)
+        flow = partial(cell_flow, one_share=engine.gpus() > 0)
+        saving = _Saving(out, jobs, display, flow, product_folders)
         run_flows(
             engine, saving.next_flow, Listener(saving.finished, saving.failed, display.progress, tick=display.tick)
         )
@@ -124,8 +127,15 @@ def _check_installed() -> None:
 class _Saving:
     """Saves results as folders. Each cell is locked while it is trained, so several commands may share `out`."""
 
-    def __init__(self, out: Path, jobs: dict[str, CellJob], display: Display, *, one_share: bool) -> None:
-        self._out, self._jobs, self._display, self._one_share = out, jobs, display, one_share
+    def __init__(
+        self,
+        out: Path,
+        jobs: dict[str, CellJob],
+        display: Display,
+        flow: Callable[[CellJob], Flow[tuple[CellResult, bytes]]],
+        kept: Callable[[Path, str], list[Path]],
+    ) -> None:
+        self._out, self._jobs, self._display, self._flow, self._kept = out, jobs, display, flow, kept
         self._left = list(jobs)
         self._locks: dict[str, FileLock] = {}
         self.reasons: dict[str, str] = {}
@@ -140,14 +150,14 @@ class _Saving:
                 self._locks[key] = lock
                 if not (self._out / key).is_dir():
                     self._display.start(key)
-                    return key, cell_flow(self._jobs[key], one_share=self._one_share)
+                    return key, self._flow(self._jobs[key])
             self._display.say(f"{self._jobs[key].cell.label}: another process has taken it")
         return None
 
     def finished(self, name: str, value: tuple[CellResult, bytes]) -> None:
         """Save the result."""
         value[0].save(self._out / name)
-        for folder in product_folders(self._jobs[name].scratch, name):
+        for folder in self._kept(self._jobs[name].scratch, name):
             shutil.rmtree(folder, ignore_errors=True)
         self._display.finish(name)
         self._locks.pop(name).release()
