@@ -41,5 +41,9 @@ def trainer(device: torch.device, epochs: int, load: str, remedy: str, **options
             )
     except torch.OutOfMemoryError as error:
         raise BadInputError(f"{device} has too little memory for {load} ({error}); {remedy}") from error
+    except SystemExit as error:
+        if isinstance(error.__context__, KeyboardInterrupt):  # Lightning makes Ctrl-C an exit with code 1
+            raise KeyboardInterrupt from None
+        raise
     finally:
         logger.setLevel(level)

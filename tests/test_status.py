@@ -6,7 +6,6 @@ import platform
 import shutil
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -102,10 +101,7 @@ def test_a_store_without_sweeps_is_left_as_it_is(tmp_path, empty_store, capsys):
     run = tracker.start_cell(sweep, PLAN.cells[FIRST], FIRST, PLAN.settings, PLAN.grid.policy_seeds)
     run.note(device="CPU")
     run.progress("policy", 7, 100)
-    for _ in range(200):
-        if "progress" in tracker.attempts([FIRST])[FIRST][0].tags:
-            break
-        time.sleep(0.1)
+    run.flush_live()
     assert main(["heads", "--tracking", uri, "--json"]) == 0
     cell = json.loads(capsys.readouterr().out)["cells"][0]
     assert (cell["state"], cell["stage"], cell["epoch"], cell["device"]) == ("running", "policy", 7, "CPU")
