@@ -11,8 +11,8 @@ random: values cost no time.
 Printed are medians with the lowest and highest; the floor of a stage is what its multiplications take at the speed of a
 large matrix product on one core, or its bytes at the speed of a copy, whichever takes longer. On a processor that
 does not multiply bf16 itself everything is in float32, and what is left out is said and null in the result. Slow
-processors get fewer frames: all takes less than ten minutes. `--quick` tries everything on almost no data, and keeps
-nothing.
+processors get fewer frames, and slow or busy ones fewer rounds: all takes less than ten minutes. `--quick` tries
+everything on almost no data, and keeps nothing.
 """
 
 from __future__ import annotations
@@ -60,15 +60,17 @@ from study.stages import ENCODER, POLICY, Batch, Flow, Task
 RESULT = Path(__file__).parent / "results" / "training.json"
 BATCHES = {"laptop": 128, "paper": 2048}  # of encoders
 FRAMES = {"laptop": (1536, 384), "paper": (4096, 1024)}  # train, test
-EPOCHS = 5  # of ours and of the bare loop; the first is not counted
-PLAIN_EPOCHS = 3  # of the template; the first is not counted
+CONFIGURATIONS = (("laptop", "rec"), ("laptop", "full"), ("paper", "full"))
+EPOCHS = {"laptop": 5, "paper": 3}  # of ours and of the bare loop; the first is not counted
+PLAIN_EPOCHS = {"laptop": 3, "paper": 2}  # of the template; the first is not counted
+LATEST = {"encoder": 240.0, "round": 420.0}  # [s] after the start, when another encoder or round still begins
 PROBE = 256  # frames on which the processor's speed is tried before
 FAST = 300.0  # images/s of `full` in a bare loop on one core, from which on all frames are used
 POLICY_FRAMES = {"laptop": (10_000, 2_500), "paper": (64_000, 16_000)}
 POLICY_BATCHES = {"laptop": 512, "paper": 2048}
 POLICY_EPOCHS = 4  # of a plain fit; the first is not counted
 STACKED_EPOCHS = {"laptop": 50, "paper": 10}  # of ours, all counted; a study's are 100
-POLICY_ROUNDS = 3
+POLICY_ROUNDS = 3  # or fewer, at LATEST
 SEEDS = 15
 WORKERS = 2  # of the engine; as many shares of the seeds
 CPU = torch.device("cpu")
@@ -273,13 +275,13 @@ def encoder(engine: DaskEngine, heads: str, size: str, limits: Numbers) -> Numbe
     batch, (train, test) = BATCHES[size], FRAMES[size]
     frames = random_frames(train, test)
     precision = choose_precision("auto", CPU)
-    settings = EncoderSettings(batch=batch, epochs=EPOCHS)
+    settings = EncoderSettings(batch=batch, epochs=EPOCHS[size])
     steps = plan_training(frames, 1.0, 0, settings, FramesSettings()).steps
-    templates = {"template": plain.fit_encoder(frames, heads, batch, PLAIN_EPOCHS, "32-true")}
+    templates = {"template": plain.fit_encoder(frames, heads, batch, PLAIN_EPOCHS[size], "32-true")}
     task = Task(ENCODER, turn_about, (heads, (train, test), settings), reports=True)
     (found,) = run_flow(one_batch(task), engine)
     templates["template_bf16"] = (
-        plain.fit_encoder(frames, heads, batch, PLAIN_EPOCHS, "bf16-mixed") if has_bf16() else []
+        plain.fit_encoder(frames, heads, batch, PLAIN_EPOCHS[size], "bf16-mixed") if has_bf16() else []
     )
     rates = {name: [train / seconds for seconds in found[name]] for name in ("ours", "bare")}
     rates |= {name: [train / seconds for seconds in epochs] for name, epochs in templates.items()}
@@ -313,15 +315,18 @@ def use_fewer_frames() -> None:
         FRAMES[size] = (steps * BATCHES[size], steps * BATCHES[size] // 4)
 
 
-def encoders(limits: Numbers) -> Numbers:
-    """All configurations, and the worst of each ratio."""
+def encoders(limits: Numbers, began: float, skipped: list[str]) -> Numbers:
+    """All configurations that there is time for, and the worst of each ratio."""
     found = []
-    for size, heads in itertools.product(BATCHES, ("rec", "full")):
+    for size, heads in CONFIGURATIONS:
+        if found and time.monotonic() - began > LATEST["encoder"]:
+            skipped.append(f"encoder {heads} at batch {BATCHES[size]}: no time left, the machine is slow or busy")
+            continue
         with scratch_engine(1) as engine:
             found.append(encoder(engine, heads, size, limits))
         print(json.dumps(found[-1]), file=sys.stderr)  # it takes minutes: what is measured should not be lost
     return {
-        "images_per_s": found[-1]["images_per_s"]["ours"]["median"],  # `full` at the paper's batch
+        "images_per_s": found[-1]["images_per_s"]["ours"]["median"],  # of the last, `full`
         "ratio_to_bare": min(each["ratio_to_bare"]["median"] for each in found),
         "ratio_to_template": min(each["ratio_to_template"] for each in found),
         "reporting_share": max(each["reporting_share"] for each in found),
@@ -346,7 +351,7 @@ def memory(precision: str) -> int:
 
 
 def train_for_memory(precision: str) -> None:
-    """Train `full` on two batches for two epochs, look at our own memory every 5 ms, print the highest."""
+    """Train `full` on two batches, look at our own memory every 5 ms, print the highest."""
     page, seen, done = os.sysconf("SC_PAGE_SIZE"), [0], threading.Event()
 
     def look() -> None:
@@ -357,7 +362,7 @@ def train_for_memory(precision: str) -> None:
     watcher = threading.Thread(target=look)
     watcher.start()
     batch = BATCHES["paper"]
-    settings = EncoderSettings(batch=batch, epochs=2, lr=5e-3, precision=precision)  # type: ignore[arg-type]
+    settings = EncoderSettings(batch=batch, epochs=1, lr=5e-3, precision=precision)  # type: ignore[arg-type]
     with tempfile.TemporaryDirectory() as folder:
         frames = random_frames(2 * batch, batch // 2, Path(folder))
         train_encoder(
@@ -414,7 +419,7 @@ def seconds_of_an_epoch(
     return (time.perf_counter() - begin) / epochs
 
 
-def policies(engine: DaskEngine, size: str, limits: Numbers) -> Numbers:
+def policies(engine: DaskEngine, size: str, limits: Numbers, began: float) -> Numbers:
     """Seconds an epoch of 15 policies, in shares and one after the other, and how many times faster the shares are.
 
     The plain fit is measured with a thread for each core, and with one: small products gain little from two, and lose
@@ -425,7 +430,9 @@ def policies(engine: DaskEngine, size: str, limits: Numbers) -> Numbers:
     seconds: dict[str, list[float]] = {"ours": [], "sequential": [], "sequential_one_thread": []}
     ratios = []
     seconds_of_an_epoch(engine, *(latents(frames, 0) for frames in (batch, 100)), batch, 5)  # workers load libraries
-    for _ in range(POLICY_ROUNDS):
+    for turn in range(POLICY_ROUNDS):
+        if turn and time.monotonic() - began > LATEST["round"]:
+            break
         torch.set_num_threads(cores())
         plain_epochs = [SEEDS * epoch for epoch in plain.fit_policy(train, test, batch, POLICY_EPOCHS)]
         torch.set_num_threads(1)
@@ -529,10 +536,10 @@ def main() -> None:
             print(f"left out: {reason}", file=sys.stderr)
         if not options.quick:
             use_fewer_frames()
-        result["encoder"] = encoders(result["limits"])
+        result["encoder"] = encoders(result["limits"], began, result["skipped"])
         result["memory_bytes"] = {"bf16": memory("bf16") if has_bf16() else None, "fp32": memory("fp32")}
     with scratch_engine(WORKERS) as engine:
-        sizes = {size: policies(engine, size, result["limits"]) for size in POLICY_FRAMES}
+        sizes = {size: policies(engine, size, result["limits"], began) for size in POLICY_FRAMES}
     worst = min(each["ratio_to_sequential"]["median"] for each in sizes.values())
     measured = machine()
     told = {name: measured[name] for name in ("cpu", "commit", "load_before")}  # of --policies, too
