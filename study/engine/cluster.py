@@ -128,8 +128,10 @@ class DaskEngine:
                 said = True
             time.sleep(0 if self._slots else WAIT)
             check_stopped()
+        name = str(file)  # a lambda travels by value: workers may lack this program, which the first task says
         with self._lost():
-            return bool(seen := self._client.run(partial(_sees, str(file)))) and all(seen.values())
+            seen = self._client.run(lambda: os.path.isfile(name))  # noqa: PTH113
+        return bool(seen) and all(seen.values())
 
     def submit(self, number: int, task: Task) -> None:
         """Hand the task to the scheduler."""
@@ -176,7 +178,10 @@ class DaskEngine:
         except CancelledError:
             raise self._gone() from None
         except Exception as error:  # noqa: BLE001 - what kept the task from running at all, such as a missing package
-            return Failure(f"{type(error).__name__}: {error}", transient=False)
+            step = (
+                "; install this program and requirements.lock on every worker" if isinstance(error, ImportError) else ""
+            )
+            return Failure(f"{type(error).__name__}: {error}{step}", transient=False)
 
     @contextmanager
     def _lost(self) -> Iterator[None]:
@@ -213,10 +218,6 @@ def _run_on_worker(topic: str, number: int, task: Task) -> Any:
         worker.log_event(topic, (number, values))
 
     return perform(task, report)
-
-
-def _sees(file: str) -> bool:
-    return Path(file).is_file()
 
 
 # --- this machine ---------------------------------------------------------------------------------------------------
