@@ -256,6 +256,10 @@ def test_certificates_that_are_none_are_one_clear_error(tmp_path, monkeypatch):
 )
 def test_a_file_that_describes_no_cluster_is_one_clear_error(tmp_path, monkeypatch, content, says):
     monkeypatch.chdir(tmp_path)
+    sbatch = tmp_path / "bin/sbatch"  # what is wrong is the file
+    sbatch.parent.mkdir()
+    sbatch.touch(0o755)
+    monkeypatch.setenv("PATH", str(sbatch.parent), prepend=os.pathsep)
     Path("batch.yaml").write_text(yaml.safe_dump(content))
     with pytest.raises(BadInputError, match=rf"batch\.yaml.*{says}"):
         cluster_engine("batch.yaml")

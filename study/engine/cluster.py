@@ -10,6 +10,7 @@ import ipaddress
 import logging
 import os
 import pickle
+import shutil
 import signal
 import sys
 import time
@@ -374,11 +375,20 @@ def read_jobs(path: Path) -> tuple[Callable[..., Any], dict[str, Any], int]:
         raise one_of(f"{path}: class", str(name), JOB_CLASSES)
     if not isinstance(arguments, Mapping) or not isinstance(workers, int) or workers < 1:
         raise BadInputError(f"{path}: 'arguments' must be a mapping and 'workers' a number of 1 or more")
+    if arguments.keys() & {"security", "protocol"}:
+        raise BadInputError(f"{path}: leave out 'security' and 'protocol'; workers always connect over TLS")
     try:
         import dask_jobqueue  # noqa: PLC0415 - an extra that only batch systems need
     except ModuleNotFoundError:
         raise BadInputError(f"{path} needs dask-jobqueue: pip install 'study[cluster]'") from None
-    return getattr(dask_jobqueue, name), dict(arguments), workers
+    kind = getattr(dask_jobqueue, name)
+    command = kind.job_cls.submit_command.split()[0]
+    if shutil.which(command) is None:  # Dask would wait for workers that nobody starts
+        raise BadInputError(
+            f"{path}: {name} submits jobs with {command}, which is not on this machine; start the sweep "
+            "where jobs are submitted, such as a login node"
+        )
+    return kind, dict(arguments), workers
 
 
 def start_jobs(kind: Callable[..., Any], arguments: Mapping[str, Any], workers: int, source: str) -> DaskEngine:
@@ -392,8 +402,6 @@ def start_jobs(kind: Callable[..., Any], arguments: Mapping[str, Any], workers: 
         "protocol": "tls://",
         "silence_logs": logging.CRITICAL,
     }
-    if arguments.keys() & {"security", "protocol"}:
-        raise BadInputError(f"{source}: leave out 'security' and 'protocol'; workers always connect over TLS")
     quiet = {"dashboard": False, "dashboard_address": "127.0.0.1:0"}  # which would be for everyone to read
     options = {**defaults, **arguments, "scheduler_options": quiet | arguments.get("scheduler_options", {})}
     try:
