@@ -23,7 +23,7 @@ Environment, of pack unless said otherwise:
   THERE    version of the GPU machine's Python, x86-64 (default: 3.12)
   WHEELS   packages that the GPU machine lacks, as in requirements.lock (default: pydantic and its needs, pyyaml,
            safetensors, filelock; "" for none)
-  DASK     no (default), or yes: then Dask's wheels (5 MB) travel, too
+  DASK     no (default), or yes: then Dask's wheels (4 MB) travel, too
   RECORD   here (default), or there: then the simulator's wheels (15 MB) travel instead of the drives (0.6 GB), and the
            GPU machine needs matplotlib and scipy
 END
@@ -42,7 +42,7 @@ pack() {
   read -ra grid <<< "${SWEEP:-heads}"
   local wheels=${WHEELS-pydantic pydantic-core annotated-types typing-inspection typing-extensions pyyaml safetensors filelock}
   [ "${DASK:-no}" = no ] || wheels+=" distributed dask click cloudpickle fsspec jinja2 markupsafe locket msgpack packaging \
-    partd psutil sortedcontainers tblib toolz tornado zict"
+    partd psutil sortedcontainers tblib toolz tornado zict importlib-metadata zipp"
   [ "$record" = here ] || wheels+=" highway-env gymnasium farama-notifications cloudpickle pygame-ce"
   mkdir -p "$folder/wheels"
   git -C "$root" archive HEAD study sweeps benchmarks requirements.lock .git_archival.txt | tar -x -C "$folder"
