@@ -7,6 +7,7 @@ import gc
 import os
 import signal
 import time
+from collections import Counter
 from operator import mul
 from pathlib import Path
 from threading import Lock
@@ -15,11 +16,12 @@ import psutil
 import pytest
 import yaml
 
+from listening import listen
 from servers import free_port
 from study.config import BadInputError
 from study.engine import cluster
 from study.engine.cluster import check_address, cluster_engine, local_engine, start_jobs, visible_gpus
-from study.engine.flows import TRIES, Listener, run_flow, run_flows
+from study.engine.flows import TRIES, run_flow
 from study.stages import ENCODER, Batch, Task
 
 GPU = "7"
@@ -35,41 +37,8 @@ def engine(tmp_path_factory):
     assert psutil.wait_procs(workers, timeout=30)[1] == []  # none outlives its engine
 
 
-class Heard:
-    """Notes products, failures and what tasks report."""
-
-    def __init__(self):
-        self.products, self.failures, self.reasons = {}, {}, []
-        self.logs, self.steps, self.processes = [], [], []
-
-    def started(self, name, host, process):
-        self.processes.append(process)
-
-    def progress(self, name, stage, done, total):
-        self.steps.append((done, total))
-
-    def log(self, name, stage, epoch, metrics):
-        self.logs.append((name, epoch, metrics["loss"]))
-
-    def retry(self, name, reason):
-        self.reasons.append(reason)
-
-    def finished(self, name, value):
-        self.products[name] = value
-
-    def failed(self, name, failure):
-        self.failures[name] = failure
-
-
 def flow(function, *argument_lists, **options):
     return (yield Batch([Task(ENCODER, function, arguments, **options) for arguments in argument_lists]))
-
-
-def run(engine, flows):
-    heard, left = Heard(), iter(list(flows.items()))
-    listener = Listener(heard.finished, heard.failed, heard.progress, heard.started, log=heard.log, retry=heard.retry)
-    run_flows(engine, lambda: next(left, None), listener)
-    return heard
 
 
 # --- what workers do ------------------------------------------------------------------------------------------------
@@ -112,16 +81,18 @@ def deaf_threads():
 
 
 def test_results_come_from_other_processes_in_the_order_of_the_tasks(engine):
-    heard = run(engine, {name: flow(square, *((number,) for number in range(8))) for name in "ab"})
+    heard = listen(engine, {name: flow(square, *((number,) for number in range(8))) for name in "ab"})
     assert heard.products == {name: [number**2 for number in range(8)] for name in "ab"}
-    assert len(heard.processes) == 16
-    assert os.getpid() not in heard.processes
+    processes = [process for _, _, process in heard.starts]
+    assert len(processes) == 16
+    assert os.getpid() not in processes
 
 
 def test_whatever_a_task_reports_is_heard_before_its_end(engine):
-    heard = run(engine, {str(number): flow(work, (3,), reports=True) for number in range(12)})
-    assert sorted(heard.logs) == sorted((str(number), step, 1 / step) for number in range(12) for step in (1, 2, 3))
-    assert {step: heard.steps.count(step) for step in heard.steps} == dict.fromkeys([(0, 1), (1, 3), (2, 3)], 12) | {
+    heard = listen(engine, {str(number): flow(work, (3,), reports=True) for number in range(12)})
+    losses = [(name, epoch, metrics["loss"]) for name, _, epoch, metrics in heard.logs]
+    assert sorted(losses) == sorted((str(number), step, 1 / step) for number in range(12) for step in (1, 2, 3))
+    assert Counter((done, total) for _, done, total in heard.steps) == dict.fromkeys([(0, 1), (1, 3), (2, 3)], 12) | {
         (3, 3): 24
     }  # as told by the task, and by its end
 
@@ -135,7 +106,7 @@ def test_a_task_whose_worker_is_killed_runs_again(engine, tmp_path, times):
 
 def test_a_task_that_kills_every_worker_is_given_up_and_harms_no_other(engine, tmp_path):
     diary = tmp_path / "diary"
-    heard = run(engine, {"deadly": flow(die, (diary, 99)), **{name: flow(square, (3,), (4,)) for name in "abc"}})
+    heard = listen(engine, {"deadly": flow(die, (diary, 99)), **{name: flow(square, (3,), (4,)) for name in "abc"}})
     assert heard.products == {name: [9, 16] for name in "abc"}
     assert heard.failures.keys() == {"deadly"}
     assert f"killed {TRIES} times" in heard.failures["deadly"].reason
@@ -145,7 +116,7 @@ def test_a_task_that_kills_every_worker_is_given_up_and_harms_no_other(engine, t
 
 
 def test_a_result_that_cannot_travel_fails_its_flow_only(engine):
-    heard = run(engine, {"back": flow(Lock, ()), "a": flow(square, (2,))})
+    heard = listen(engine, {"back": flow(Lock, ()), "a": flow(square, (2,))})
     assert heard.products == {"a": [4]}
     assert "pickle" in heard.failures["back"].reason
 
@@ -161,7 +132,7 @@ def test_a_gpu_whose_worker_restarts_is_waited_for(engine, tmp_path, monkeypatch
     monkeypatch.setattr(cluster, "SIZE", 0.0)  # notices at once that the worker is gone
     dies = flow(die, (tmp_path / "diary", 1), accelerated=True)
     waits = flow(environment, *[("CUDA_VISIBLE_DEVICES",)] * 2, accelerated=True)
-    assert run(engine, {"dies": dies, "waits": waits}).products == {"dies": ["alive"], "waits": [GPU, GPU]}
+    assert listen(engine, {"dies": dies, "waits": waits}).products == {"dies": ["alive"], "waits": [GPU, GPU]}
 
 
 def test_a_file_is_seen_by_workers_of_the_same_folder(engine, tmp_path):
@@ -278,7 +249,7 @@ def test_jobs_of_a_batch_system_work_over_tls(tmp_path, monkeypatch):
     with start_jobs(LocalCluster, {"memory": "1GB"}, 1, "batch.yaml") as engine:
         assert engine._address.startswith("tls://")  # noqa: SLF001
         assert run_flow(flow(mul, (5, 5), (6, 6)), engine) == [25, 36]
-        heard = run(engine, {"lacking": flow(square, (5,)), "a": flow(mul, (2, 2))})  # this module is not there
+        heard = listen(engine, {"lacking": flow(square, (5,)), "a": flow(mul, (2, 2))})  # this module is not there
     assert heard.products == {"a": [4]}
     assert "No module named 'test_engine'" in heard.failures["lacking"].reason
     assert (tmp_path / "data" / "tmp" / "certificates").stat().st_mode & 0o077 == 0

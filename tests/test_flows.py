@@ -6,8 +6,9 @@ from collections import deque
 
 import pytest
 
+from listening import listen
 from study.config import BadInputError, TrainingDivergedError
-from study.engine.flows import TRIES, FlowFailedError, Listener, run_flow, run_flows
+from study.engine.flows import TRIES, FlowFailedError, run_flow
 from study.engine.tasks import perform
 from study.stages import ENCODER, LATENTS, POLICY, Batch, Task
 
@@ -47,37 +48,8 @@ class Machine:
         return [(number, perform(task, lambda *values: hear(number, *values)))]
 
 
-class Heard:
-    """Notes all events of one kind or another."""
-
-    def __init__(self):
-        self.products, self.failures, self.reasons, self.logs, self.steps, self.starts = {}, {}, [], [], [], []
-
-    def started(self, name, host, process):
-        self.starts.append((name, host, process))
-
-    def progress(self, name, stage, done, total):
-        self.steps.append((stage, done, total))
-
-    def log(self, name, stage, epoch, metrics):
-        self.logs.append((name, stage, epoch, metrics))
-
-    def retry(self, name, reason):
-        self.reasons.append(reason)
-
-    def finished(self, name, value):
-        self.products[name] = value
-
-    def failed(self, name, failure):
-        self.failures[name] = failure
-
-
 def run(flows, engine=None):
-    """What a listener heard of these flows, by name."""
-    heard, left = Heard(), iter(list(flows.items()))
-    listener = Listener(heard.finished, heard.failed, heard.progress, heard.started, log=heard.log, retry=heard.retry)
-    run_flows(engine or Machine(), lambda: next(left, None), listener)
-    return heard
+    return listen(engine or Machine(), flows)
 
 
 def note(diary, word):

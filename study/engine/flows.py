@@ -5,6 +5,7 @@ A task that fails in a way that may pass is tried again, `TRIES` times in all; i
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import defaultdict
 from collections.abc import Callable, Mapping
@@ -88,7 +89,7 @@ class _Flows:
         self._engine, self._next_flow, self._listener = engine, next_flow, listener
         self._ready: list[_Try] = []  # in the order in which they should run: earlier flows first
         self._submitted: dict[int, _Try] = {}
-        self._numbers = iter(range(10**12))
+        self._numbers = itertools.count()
         self._begun = 0
 
     def run(self) -> None:
