@@ -46,6 +46,7 @@ from study.stages import Task
 
 CONNECT = 10.0  # [s] a scheduler has to answer in
 SIZE = 5.0  # [s] between two looks at how many workers there are
+SET_BACK = 5.0  # [s] by which this machine's clock may be set back while tasks run
 GPU_DRIVERS = ("/dev/nvidiactl", "/dev/kfd", "/dev/dxg")  # of CUDA, ROCm, and either in WSL
 GPU = "GPU"  # the resource that a worker with a GPU has one of
 CERTIFICATES = {"tls_ca_file": "ca.pem", "tls_client_cert": "cert.pem", "tls_client_key": "key.pem"}
@@ -80,6 +81,7 @@ class DaskEngine:
         self._futures: dict[int, Future[Any]] = {}
         self._messages: SimpleQueue[tuple[str, int, Any]] = SimpleQueue()
         self._looked, self._slots, self._gpus = 0.0, 0, 0
+        self._clock = time.time() - time.monotonic()
         client.subscribe_topic(self._topic, self._take)
 
     def __enter__(self) -> Self:
@@ -155,6 +157,7 @@ class DaskEngine:
 
     def wait(self, seconds: float, hear: Hear) -> list[tuple[int, Any]]:
         """Return what has ended since; see `Engine`. Raises EngineLostError when the scheduler is gone."""
+        self._check_clock()
         ended: list[tuple[int, Any]] = []
         deadline = time.monotonic() + seconds
         while not ended or not self._messages.empty():
@@ -169,6 +172,15 @@ class DaskEngine:
         if self._client.status != "running":  # what ran is lost to it, even if it connects again
             raise self._gone()
         return ended
+
+    def _check_clock(self) -> None:
+        """Raise EngineLostError when the clock was set back: Dask's messages may wait until it has caught up."""
+        before, self._clock = self._clock, time.time() - time.monotonic()
+        if before - self._clock > SET_BACK:
+            raise EngineLostError(
+                f"this machine's clock was set back by {before - self._clock:.0f} s, which stops messages between "
+                "processes; nothing that was finished is lost: give the same command again"
+            )
 
     def _value(self, future: Future[Any]) -> Any:
         try:
