@@ -26,6 +26,7 @@ test: $(VENV)/.installed ## lint, types and the tests
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
+	$(VENV)/bin/lint-imports --no-logo
 	$(RUN) -m pytest -m "not stress" $(ARGS)
 
 stress: $(VENV)/.installed ## the long fault tests: kills, clusters

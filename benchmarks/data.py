@@ -27,10 +27,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from study.birdview import Renderer, valid_moments
-from study.config import IMAGE, StudySettings, frames_key, load_profile
-from study.episode import read_episode, write_episode
-from study.provenance import ROOT, provenance
+from study.compute.provenance import ROOT, provenance
+from study.config.files import load_profile
+from study.config.keys import frames_key
+from study.config.paper import IMAGE
+from study.config.settings import StudySettings
+from study.data.birdview import Renderer, valid_moments
+from study.episode.files import read_episode, write_episode
 from study.sim.autopilot import DT
 from study.sim.env import Traffic, make_traffic
 from study.sim.record import record_episode

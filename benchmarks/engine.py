@@ -29,21 +29,24 @@ from typing import Any
 import numpy as np
 
 from study.cell import SHARE_SECONDS, cell_flow
-from study.config import LATENT, load_profile
-from study.data import DATA, data_flow
-from study.engine.cluster import DaskEngine, local_engine
+from study.compute.provenance import ROOT, provenance
+from study.config.files import load_profile
+from study.config.paper import LATENT
+from study.config.workspace import DATA
+from study.data.prepare import data_flow
 from study.engine.flows import run_flow
-from study.plan import Plan, cell_jobs, make_plan
-from study.provenance import ROOT, provenance
-from study.result import CellResult
+from study.engine.local import local_engine
+from study.engine.workers import DaskEngine
+from study.results.cell_result import CellResult
 from study.stages import ENCODER, POLICY, RESULT, Batch, Flow, Task, cell_cost
+from study.sweep.plan import Plan, cell_jobs, make_plan
 
 RESULT_FILE = Path(__file__).parent / "results" / "engine.json"
 WORKERS = 2
 STARTS, SINGLE, MANY, REPORTS, CELLS, LIVE = 5, 50, 400, 2000, 8, 20
 REPORT_EVERY = 0.25  # [s] between two reports of an encoder's progress
 PACKAGES = ("distributed", "mlflow", "optuna", "numpy", "torch")
-IMPORT = "import time; t = time.perf_counter(); import study.engine.cluster; print(time.perf_counter() - t)"
+IMPORT = "import time; t = time.perf_counter(); import study.engine.local; print(time.perf_counter() - t)"
 
 Numbers = dict[str, Any]
 
@@ -71,9 +74,9 @@ def nothing(*_: object) -> None:
 def load_libraries() -> float:
     """Import what the stages of a cell compute with; returns the seconds."""
     begin = time.perf_counter()
-    import study.autoencoder  # noqa: PLC0415
-    import study.exported  # noqa: PLC0415
-    import study.policy  # noqa: F401, PLC0415
+    import study.driving.driver  # noqa: PLC0415
+    import study.encoder.training  # noqa: PLC0415
+    import study.policy.training  # noqa: F401, PLC0415
 
     return time.perf_counter() - begin
 
@@ -135,7 +138,7 @@ def measure_tracking(plan: Plan, result: CellResult, network: bytes) -> Numbers:
     """What a sweep of CELLS cells takes in MLflow and Optuna, all with the same result."""
     # Not at the top: workers load this file, too, and in a sweep they need no MLflow.
     from study.engine.trials import Trials  # noqa: PLC0415
-    from study.tracking import Tracker  # noqa: PLC0415
+    from study.tracking.tracker import Tracker  # noqa: PLC0415
 
     keys = {f"{number:016x}": result.cell for number in range(CELLS)}
     found: dict[str, list[float]] = {"cell_start_s": [], "live_write_s": [], "cell_commit_s": [], "cell_trial_s": []}
@@ -179,7 +182,7 @@ def measure_tracking(plan: Plan, result: CellResult, network: bytes) -> Numbers:
 
 def count_work(plan: Plan) -> Numbers:
     """Tasks, reports and cells of a sweep, and the seconds that its stages are expected to take."""
-    from study.tracking import FLUSH, SIGN  # noqa: PLC0415 - as above
+    from study.tracking.cell_run import FLUSH, SIGN  # noqa: PLC0415 - as above
 
     recording = plan.settings.recording
     drives = recording.encoder_episodes + recording.policy_episodes

@@ -15,10 +15,12 @@ import itertools
 
 import pandas as pd
 
-from study import claims, stats
-from study.config import DEFAULT_TRACKING, HEAD_SETS, load_grid
-from study.stats import Panel
-from study.tracking import Tracker
+from study.analysis import claims, learning_curves
+from study.analysis.learning_curves import Panel
+from study.config.files import load_grid
+from study.config.heads import HEAD_SETS
+from study.config.workspace import DEFAULT_TRACKING
+from study.tracking.tracker import Tracker
 
 
 def posing(curves: pd.DataFrame, seeds: tuple[int, ...]) -> Panel:
@@ -40,7 +42,9 @@ def main() -> None:
     options = parser.parse_args()
     record = Tracker(options.tracking).read_sweep(options.sweep, options.profile)
     point, table = (options.heads, max(record.grid.fractions)), record.table()
-    accuracy, steering = (stats.panel(table, metric)[point] for metric in (stats.ACCURACY, stats.STEERING))
+    accuracy, steering = (
+        learning_curves.panel(table, metric)[point] for metric in (learning_curves.ACCURACY, learning_curves.STEERING)
+    )
     seeds = accuracy.index.get_level_values("encoder_seed").unique()
     floor, grid = claims.steering_floor(record, point), load_grid("heads", profile=record.profile)
     ways = list(itertools.permutations(seeds, len(HEAD_SETS)))

@@ -75,7 +75,7 @@ train() {
     mv site.draft site
   fi
   mapfile -t words < settings
-  PYTHONPATH=.:site${PYTHONPATH:+:$PYTHONPATH} exec "$python" -m study.train "${words[@]}" --out results \
+  PYTHONPATH=.:site${PYTHONPATH:+:$PYTHONPATH} exec "$python" -m study.sweep train "${words[@]}" --out results \
     --limit-seconds "${1:-540}"
 }
 

@@ -20,9 +20,10 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.utils.data import DataLoader, Dataset, TensorDataset
 
-from study.config import CHANNELS, CORE, DROPOUT, HEAD_SETS, HEADS, IMAGE, KERNEL, LATENT, STRIDE
-from study.frames import Frames
-from study.policy import WIDTHS
+from study.config.heads import HEAD_SETS, HEADS
+from study.config.paper import CHANNELS, CORE, DROPOUT, IMAGE, KERNEL, LATENT, STRIDE
+from study.data.frames import Frames
+from study.policy.networks import WIDTHS
 
 WORKERS = 2  # of the encoder's DataLoader
 

@@ -36,25 +36,21 @@ import pandas as pd
 import plain
 import torch
 
-from study import autoencoder
-from study.autoencoder import MultiHeadAutoencoder, choose_precision, plan_training, train_encoder
-from study.config import (
-    CHANNELS,
-    CORE,
-    HEAD_SETS,
-    HEADS,
-    IMAGE,
-    KERNEL,
-    LATENT,
-    EncoderSettings,
-    FramesSettings,
-    PolicySettings,
-)
-from study.engine.cluster import DaskEngine, local_engine
+from study.compute.device import choose_precision
+from study.compute.provenance import cores, provenance
+from study.config.heads import HEAD_SETS, HEADS
+from study.config.paper import CHANNELS, CORE, IMAGE, KERNEL, LATENT
+from study.config.settings import EncoderSettings, FramesSettings, PolicySettings
+from study.data.frames import SHAPES, Frames
+from study.encoder import checkpoint, training
+from study.encoder.autoencoder import MultiHeadAutoencoder
+from study.encoder.batches import plan_training
+from study.encoder.training import train_encoder
 from study.engine.flows import run_flow
-from study.frames import SHAPES, Frames
-from study.policy import WIDTHS, TrainedPolicies, join_policies, train_policies
-from study.provenance import cores, provenance
+from study.engine.local import local_engine
+from study.engine.workers import DaskEngine
+from study.policy.networks import WIDTHS
+from study.policy.training import TrainedPolicies, join_policies, train_policies
 from study.stages import ENCODER, POLICY, Batch, Flow, Task
 
 RESULT = Path(__file__).parent / "results" / "training.json"
@@ -209,18 +205,18 @@ def bare_epochs(frames: Frames, heads: str, settings: EncoderSettings, precision
 def timed_checkpoints() -> Iterator[list[float]]:
     """Seconds of each checkpoint that is written meanwhile."""
     seconds: list[float] = []
-    write = autoencoder._write_checkpoint  # noqa: SLF001 - only here its time can be told from the rest
+    write = checkpoint.write_checkpoint  # noqa: SLF001 - only here its time can be told from the rest
 
     def timed(*what: Any) -> None:
         begin = time.perf_counter()
         write(*what)
         seconds.append(time.perf_counter() - begin)
 
-    autoencoder._write_checkpoint = timed  # noqa: SLF001
+    checkpoint.write_checkpoint = timed  # noqa: SLF001
     try:
         yield seconds
     finally:
-        autoencoder._write_checkpoint = write  # noqa: SLF001
+        checkpoint.write_checkpoint = write  # noqa: SLF001
 
 
 def turn_about(
@@ -298,7 +294,7 @@ def encoder(engine: DaskEngine, heads: str, size: str, limits: Numbers) -> Numbe
         "images_per_s": {name: spread(values) for name, values in rates.items()},
         "ratio_to_bare": spread(pairs),
         **{f"ratio_to_{name}": ours / float(np.median(rates[name])) if rates[name] else None for name in templates},
-        "reporting_share": reporting + float(np.median(found["checkpoint"])) / autoencoder.CHECKPOINT_SECONDS,
+        "reporting_share": reporting + float(np.median(found["checkpoint"])) / training.CHECKPOINT_SECONDS,
         "checkpoint_s": spread(found["checkpoint"]),
         "floor": limit | {"reached": ours / limit["per_s"]},
     }

@@ -19,14 +19,16 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from study.config import CEILING, BadInputError, cell_key
-from study.data import data_flow
+from study.compute.provenance import provenance
+from study.config.heads import CEILING
+from study.config.keys import cell_key
+from study.data.frames import Frames, FrameStore, open_frames
+from study.data.prepare import data_flow
 from study.engine.flows import run_flow
-from study.frames import Frames, FrameStore, open_frames
-from study.job import CellJob
+from study.errors import BadInputError
 from study.products import Arrays, read_product, write_product
-from study.provenance import provenance
-from study.result import NO_SEED, CellResult
+from study.results.cell_result import NO_SEED, CellResult
+from study.results.job import CellJob
 from study.stages import ENCODER, LATENTS, POLICY, RESULT, Batch, Flow, Task, Work
 
 PROBED = ("speed", "light", "lead_gap")  # columns of the labels that reports probe the latents for
@@ -120,7 +122,7 @@ def _keep_all(
 
 def train_cell_encoder(job: CellJob, report: Report) -> Product:
     """Train the encoder. Raises BadInputError for settings that cannot be met, TrainingDivergedError for a bad loss."""
-    from study.autoencoder import train_encoder  # noqa: PLC0415
+    from study.encoder.training import train_encoder  # noqa: PLC0415
 
     store, device, facts = _begin(job, report)
     settings, cell = job.settings, job.cell
@@ -144,8 +146,8 @@ def train_cell_encoder(job: CellJob, report: Report) -> Product:
 
 def encode_policy_set(job: CellJob, encoder: Product | None) -> Latents:
     """Return the latents of the policy set: the encoder's, or the true state."""
-    from study.autoencoder import encode  # noqa: PLC0415
-    from study.state import true_state  # noqa: PLC0415
+    from study.data.true_state import true_state  # noqa: PLC0415
+    from study.encoder.latents import encode  # noqa: PLC0415
 
     started = time.perf_counter()
     store, device, facts = _begin(job)
@@ -164,7 +166,7 @@ def encode_policy_set(job: CellJob, encoder: Product | None) -> Latents:
 
 def train_policy_share(job: CellJob, latents: Latents, seeds: list[int], report: Report) -> Product:
     """Train the policies of these seeds."""
-    from study.policy import train_policies  # noqa: PLC0415
+    from study.policy.training import train_policies  # noqa: PLC0415
 
     device = _compute_on(job, report)
     trained = train_policies(
@@ -187,8 +189,8 @@ def assemble_result(
     job: CellJob, encoder: Product | None, latents: Latents, policies: list[Product]
 ) -> tuple[CellResult, bytes]:
     """Return the result of the cell and its exported network."""
-    from study.exported import export_driver  # noqa: PLC0415
-    from study.policy import TrainedPolicies, join_policies  # noqa: PLC0415
+    from study.driving.driver import export_driver  # noqa: PLC0415
+    from study.policy.training import TrainedPolicies, join_policies  # noqa: PLC0415
 
     joined = join_policies(
         [
@@ -263,7 +265,7 @@ def _compute_on(job: CellJob, report: Report | None) -> str:
     """Set the threads, and return the device. Raises BadInputError for one that is not there."""
     import torch  # noqa: PLC0415
 
-    from study.autoencoder import check_device  # noqa: PLC0415
+    from study.compute.device import check_device  # noqa: PLC0415
 
     torch.set_num_threads(job.threads)
     device = job.device

@@ -1,13 +1,12 @@
-"""Products on disk: arrays, one table and a JSON head with everything's digest, written whole or not at all.
-
-A product is a folder. Its head is written last and names the SHA-256 of every other file, so that damage is noticed.
-"""
+"""Atomic writes: whoever reads finds the whole folder or none."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +16,21 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save
 
-from study.atomic import atomic_folder
-from study.config import BadInputError
+from study.errors import BadInputError
+
+
+@contextmanager
+def atomic_folder(folder: Path) -> Iterator[Path]:
+    """Yield an empty draft of `folder` to write into, which takes its place when the block ends without an error."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as name:
+        draft = Path(name) / folder.name
+        draft.mkdir()
+        yield draft
+        if folder.exists():
+            folder.rename(Path(name) / "old")
+        draft.rename(folder)
+
 
 Arrays = dict[str, NDArray[Any]]
 TABLE = "curves.parquet"

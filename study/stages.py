@@ -17,17 +17,11 @@ from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias, TypeVar
 
-from study.config import (
-    CEILING,
-    HEAD_SETS,
-    IMAGE,
-    Cell,
-    StudySettings,
-    cell_key,
-    encoder_key,
-    frames_key,
-    recording_key,
-)
+from study.config.grid import Cell
+from study.config.heads import CEILING, HEAD_SETS
+from study.config.keys import cell_key, encoder_key, frames_key, recording_key
+from study.config.paper import IMAGE
+from study.config.settings import StudySettings
 
 STEP_HZ = 10
 VEHICLE_FRAMES_PER_S = 90_000.0  # simulated, on two cores

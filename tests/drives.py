@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from study.episode import GREEN, RED, YELLOW, Agent, Episode, Lane, Light, empty_states, write_episode
+from study.episode.files import write_episode
+from study.episode.schema import GREEN, RED, YELLOW, Agent, Episode, Lane, Light, empty_states
 
 LANE = 3.5  # [m], width
 ARM = 120.0  # [m], from the stop line outwards

@@ -8,19 +8,13 @@ from dataclasses import dataclass, field
 import numpy as np
 import pandas as pd
 
-from study.claims import Evidence
-from study.config import (
-    ACCELERATION_HIDDEN,
-    CHANNELS,
-    CORE,
-    HEAD_SETS,
-    KERNEL,
-    LATENT,
-    STEERING_HIDDEN,
-    Grid,
-    StudySettings,
-)
-from study.result import CURVE_COLUMNS, NO_SEED, CellResult, SweepRecord
+from study.analysis.claims import Evidence
+from study.config.grid import Grid
+from study.config.heads import HEAD_SETS
+from study.config.paper import ACCELERATION_HIDDEN, CHANNELS, CORE, KERNEL, LATENT, STEERING_HIDDEN
+from study.config.settings import StudySettings
+from study.results.cell_result import CURVE_COLUMNS, NO_SEED, CellResult
+from study.results.sweep_record import SweepRecord
 
 FRAMES, EPISODES, SAMPLES = 600, 15, 16
 
@@ -97,7 +91,7 @@ class Null:
         return np.interp(np.log(np.arange(1, self.epochs + 1)), np.log(REC_EPOCHS), curve)
 
     def evidence(self, grid, seed):
-        """What `study.claims` looks at, of a study of that grid."""
+        """What `study.analysis.claims` looks at, of a study of that grid."""
         rng = np.random.default_rng(seed)
         epoch = np.arange(1, self.epochs + 1)
         mean, loss = self.mean_curve(), np.interp(np.log(epoch), np.log(REC_EPOCHS), REC_STEERING)

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from drives import write_drives
-from study.config import BirdviewSettings, FramesSettings
+from study.config.settings import BirdviewSettings, FramesSettings
+from study.data.build import frames_flow
 from study.engine.flows import run_flow
-from study.frames import frames_flow
-from study.store import SQLITE, open_store
+from study.tracking.store import SQLITE, open_store
 
 
 @pytest.fixture(scope="session")

@@ -9,17 +9,19 @@ import pandas as pd
 import pytest
 
 from drives import crossing_drive, write_drives
-from study.adapt import STEERING_UNIT, adapt, derived_commands
-from study.birdview import valid_moments
-from study.config import BadInputError, FramesSettings, load_profile
-from study.data import data_flow
+from study.config.files import load_profile
+from study.config.settings import FramesSettings
+from study.data.birdview import valid_moments
+from study.data.frames import open_frames
+from study.data.prepare import data_flow
 from study.engine.flows import run_flow
-from study.episode import file_digest, read_episode, write_episode
-from study.frames import open_frames
-from study.imported import import_drives, open_import
-from study.plan import make_plan
+from study.episode.adapt import STEERING_UNIT, adapt, derived_commands
+from study.episode.files import file_digest, read_episode, write_episode
+from study.episode.imported import import_drives, open_import
+from study.errors import BadInputError
 from study.sim import autopilot
 from study.sim.record import record_episode
+from study.sweep.plan import make_plan
 
 
 @pytest.fixture(scope="module")

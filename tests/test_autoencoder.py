@@ -20,33 +20,22 @@ from torch import nn
 from torch.nn import functional
 
 from drives import write_drives
-from study import autoencoder
-from study.autoencoder import (
-    Decoder,
-    Encoder,
-    MultiHeadAutoencoder,
-    TrainedEncoder,
-    choose_precision,
-    choose_samples,
-    encode,
-    plan_training,
-    train_encoder,
-    unpack,
-)
-from study.config import (
-    HEAD_SETS,
-    HEADS,
-    IMAGE,
-    LATENT,
-    BadInputError,
-    BirdviewSettings,
-    EncoderSettings,
-    FramesSettings,
-    TrainingDivergedError,
-    parameter_counts,
-)
+from study.compute import device
+from study.compute.device import choose_precision
+from study.config.heads import HEAD_SETS, HEADS
+from study.config.paper import IMAGE, LATENT, parameter_counts
+from study.config.settings import BirdviewSettings, EncoderSettings, FramesSettings
+from study.data.build import frames_flow
+from study.data.frames import Frames, open_frames, unpack_masks
+from study.encoder import batches, networks, training
+from study.encoder.autoencoder import MultiHeadAutoencoder
+from study.encoder.batches import plan_training
+from study.encoder.inputs import unpack
+from study.encoder.latents import choose_samples, encode
+from study.encoder.networks import Decoder, Encoder
+from study.encoder.training import TrainedEncoder, train_encoder
 from study.engine.flows import run_flow
-from study.frames import Frames, frames_flow, open_frames, unpack_masks
+from study.errors import BadInputError, TrainingDivergedError
 from waiting import questions
 
 FRAMES = FramesSettings(encoder=160, policy=40, spacing=0.3, balance="none")
@@ -244,7 +233,7 @@ def test_gradients_taken_head_by_head_are_those_of_the_total_loss(frames: Frames
     pixels, targets = images.permute(0, 3, 1, 2) / 255, unpack(masks, ["pred", "plan"])
     features = whole.encoder.features(pixels)
     mean, log_variance = whole.encoder.mean(features), whole.encoder.log_variance(features)
-    noise = autoencoder._generator(0, "noise")
+    noise = networks.seeded_generator(0, "noise")
     z = mean + (log_variance / 2).exp() * torch.randn(mean.shape, generator=noise)
     normal = torch.distributions.Normal
     kl = torch.distributions.kl_divergence(normal(mean, (log_variance / 2).exp()), normal(0.0, 1.0))
@@ -298,7 +287,7 @@ def test_bf16_follows_fp32_within_one_percent(frames: Frames) -> None:
 def test_auto_is_fp32_where_the_processor_has_no_bf16(monkeypatch: pytest.MonkeyPatch) -> None:
     cpu = torch.device("cpu")
     for flags, expected in (({"avx2"}, "fp32"), ({"avx512f", "amx_bf16"}, "bf16")):
-        monkeypatch.setattr(autoencoder, "_cpu_flags", lambda flags=flags: flags)
+        monkeypatch.setattr(device, "_cpu_flags", lambda flags=flags: flags)
         assert choose_precision("auto", cpu) == expected
     assert choose_precision("fp32", cpu) == "fp32"
 
@@ -343,11 +332,11 @@ def test_data_on_a_device_and_data_copied_ahead_give_the_batches_of_the_mapped_f
     plan, cpu = plan_training(frames, 1.0, 0, SETTINGS, FRAMES), torch.device("cpu")
     tensors = torch.tensor(frames.images), torch.tensor(frames.masks)
     for parts in (plan.parts(0), plan.parts(1)[:2], np.array_split(plan.subset, 9)):  # fewer and more than are ahead
-        mapped = list(autoencoder._Batches(frames.images, frames.masks, parts, cpu))
+        mapped = list(batches._Batches(frames.images, frames.masks, parts, cpu))
         assert [len(images) for images, _ in mapped] == [len(part) for part in parts]
         for others in (
-            autoencoder._Batches(*tensors, parts, cpu),
-            autoencoder.prefetched(frames.images, frames.masks, parts, cpu),
+            batches._Batches(*tensors, parts, cpu),
+            batches.prefetched(frames.images, frames.masks, parts, cpu),
         ):
             for one, other in zip(mapped, others, strict=True):
                 assert all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
@@ -425,20 +414,20 @@ def test_memory_of_a_step_is_estimated_from_above(frames: Frames) -> None:
             losses = module.losses(torch.tensor(frames.images[:32]), torch.tensor(frames.masks[:32]))
         assert losses.requires_grad
         activations = sum(count for pointer, count in kept.items() if pointer not in weights)
-        estimate = autoencoder.step_bytes(heads, 32, "fp32") - autoencoder.SPARE_BYTES
+        estimate = training.step_bytes(heads, 32, "fp32") - training.SPARE_BYTES
         assert activations + 2 * 32 * 31 * 31 * 32 * 4 <= estimate <= 2.5 * activations
 
 
 def test_a_gpu_with_too_little_memory_is_known_before_training(frames: Frames, monkeypatch: pytest.MonkeyPatch) -> None:
     gpu = torch.device("cuda", 0)
-    need = autoencoder.step_bytes("full", 2048, "bf16")
+    need = training.step_bytes("full", 2048, "bf16")
     for free, room in ((need, 0), (need + 100, 100)):
         monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device, free=free: (free, 2 * free))
-        assert autoencoder.check_memory(gpu, "full", 2048, "bf16") == room
-        assert autoencoder.resident(frames, gpu, room) == (frames.images, frames.masks)  # the data stay outside
+        assert training.check_memory(gpu, "full", 2048, "bf16") == room
+        assert batches.resident(frames, gpu, room) == (frames.images, frames.masks)  # the data stay outside
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (need - 1, need))
     with pytest.raises(BadInputError, match=r"cuda:0 has .* GB .*batch 2048 .* full needs about .*--encoder.batch"):
-        autoencoder.check_memory(gpu, "full", 2048, "bf16")
+        training.check_memory(gpu, "full", 2048, "bf16")
 
 
 # --- going on -------------------------------------------------------------------------------------------------------
@@ -446,8 +435,8 @@ def test_a_gpu_with_too_little_memory_is_known_before_training(frames: Frames, m
 
 @pytest.fixture
 def every_step(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(autoencoder, "CHECKPOINT_SECONDS", 0)
-    monkeypatch.setattr(autoencoder, "PROGRESS_SECONDS", 0)
+    monkeypatch.setattr(training, "CHECKPOINT_SECONDS", 0)
+    monkeypatch.setattr(training, "PROGRESS_SECONDS", 0)
 
 
 @pytest.mark.usefixtures("every_step")
@@ -517,12 +506,12 @@ def test_a_training_that_was_really_killed_goes_on(store: Path, frames: Frames, 
     program = f"""
 import torch
 from pathlib import Path
-from study import autoencoder
-from study.config import EncoderSettings, FramesSettings
-from study.frames import open_frames
+from study.encoder import training
+from study.config.settings import EncoderSettings, FramesSettings
+from study.data.frames import open_frames
 torch.set_num_threads(1)
-autoencoder.CHECKPOINT_SECONDS = 0
-autoencoder.train_encoder(
+training.CHECKPOINT_SECONDS = 0
+training.train_encoder(
     open_frames(Path({str(store)!r})).encoder, "rec", 1.0, 0, EncoderSettings(epochs=6, batch=16),
     FramesSettings.model_validate_json({FRAMES.model_dump_json()!r}), device="cpu",
     checkpoint=Path({str(checkpoint)!r}), log=lambda epoch, losses: print(epoch, flush=True),
@@ -563,9 +552,9 @@ def test_what_cannot_be_used_is_refused_with_the_way_out(frames: Frames) -> None
         train(frames, "rec+plam")
     with pytest.raises(BadInputError, match=r"batch 500 is larger than the 128 training frames.*--encoder.batch"):
         train(frames, "rec", EncoderSettings(batch=500))
-    for device in ("cuda:99", "mps"):
-        with pytest.raises(BadInputError, match=f"device '{device}' is not on this machine; choose from cpu"):
-            train(frames, "rec", device=device)
+    for name in ("cuda:99", "mps"):
+        with pytest.raises(BadInputError, match=f"device '{name}' is not on this machine; choose from cpu"):
+            train(frames, "rec", device=name)
     with pytest.raises(BadInputError, match="unknown device 'gpu'"):
         train(frames, "rec", device="gpu")
 

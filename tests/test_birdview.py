@@ -7,10 +7,13 @@ import numpy as np
 import pytest
 
 from drives import crossing_drive
-from study import birdview
-from study.birdview import Renderer, governing_light, render_birdview, valid_moments
-from study.config import FORMAT_VERSIONS, BadInputError, BirdviewSettings
-from study.episode import GREEN, RED, YELLOW, Agent, Episode, Lane, Light, check_episode, empty_states
+from study.config.keys import FORMAT_VERSIONS
+from study.config.settings import BirdviewSettings
+from study.data import birdview
+from study.data.birdview import Renderer, governing_light, render_birdview, valid_moments
+from study.episode.checks import check_episode
+from study.episode.schema import GREEN, RED, YELLOW, Agent, Episode, Lane, Light, empty_states
+from study.errors import BadInputError
 
 SETTINGS = BirdviewSettings()
 NOW = 10  # a step with a whole history and future

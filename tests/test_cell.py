@@ -9,11 +9,14 @@ import torch
 
 from study import cell as path
 from study.cell import cell_flow, product_folders
-from study.config import BadInputError, Cell, cell_key, load_profile
+from study.config.files import load_profile
+from study.config.grid import Cell
+from study.config.keys import cell_key
+from study.data.frames import open_frames
 from study.engine.flows import run_flow
-from study.frames import open_frames
-from study.job import CellJob
-from study.result import ARRAYS, CURVE_COLUMNS
+from study.errors import BadInputError
+from study.results.cell_result import ARRAYS, CURVE_COLUMNS
+from study.results.job import CellJob
 
 SETTINGS = load_profile("smoke", {"encoder": {"epochs": 2, "batch": 16}, "policy": {"epochs": 5, "batch": 16}})
 REC, CEILING = Cell(heads="rec"), Cell(heads="state")

@@ -4,8 +4,9 @@ import pytest
 from scipy.stats import binom
 
 from simulated import DATASIZE_GRID, HEADS_GRID, Null, World, simulate
-from study import claims, stats
-from study.config import HEAD_SETS, Grid, Rules
+from study.analysis import claims, comparisons, convergence, effects, intervals, learning_curves
+from study.config.grid import Grid, Rules
+from study.config.heads import HEAD_SETS
 
 
 def outcomes(record):
@@ -93,15 +94,17 @@ def test_every_verdict_has_its_rule_and_every_finding_its_n(heads):
 
 
 def test_planned_contrasts_of_the_paper():
-    assert len(claims.planned(HEADS_GRID)) == 6
-    contrasts = claims.planned(DATASIZE_GRID)
+    assert len(effects.planned(HEADS_GRID)) == 6
+    contrasts = effects.planned(DATASIZE_GRID)
     assert (("full", 0.0625), ("rec", 1.0)) in contrasts
     assert len(contrasts) == 6
 
 
 def test_comparisons_are_corrected_for_planned_contrasts_that_are_not_there_yet():
     record = simulate(HEADS_GRID, World(epochs=12), unfinished=("rec+plan 100% e0", "rec+pred 100% e0"))
-    contrast = claims.compare(record, stats.ACCURACY, stats.panel(record.table(), stats.ACCURACY))
+    contrast = effects.compare(
+        record, learning_curves.ACCURACY, learning_curves.panel(record.table(), learning_curves.ACCURACY)
+    )
     assert [(item.first[0], item.second[0]) for item in contrast] == [("full", "rec")]
     assert contrast[0].p_holm == pytest.approx(6 * contrast[0].p)
 
@@ -137,7 +140,8 @@ def claims_an_effect(verdict):
 )
 def test_a_null_study_claims_no_effect(grid, null, draws, monkeypatch):
     """Copies of rec with the spread of real curves: effects are claimed at most at the nominal rate, for each claim."""
-    monkeypatch.setattr(stats, "DRAWS", 1000)
+    for module in (intervals, comparisons, convergence):
+        monkeypatch.setattr(module, "DRAWS", 1000)
     counts = dict.fromkeys(claims.CLAIMS, 0)
     for seed in range(draws):
         for verdict in claims.weigh(null.evidence(grid, seed)):

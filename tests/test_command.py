@@ -9,7 +9,8 @@ import time
 import pytest
 
 from running import environment, sweep, working_folder
-from study.command import EXIT_AGAIN, EXIT_INTERRUPTED, STOP_SECONDS, check_stopped, stoppable
+from study.console.interrupts import STOP_SECONDS, check_stopped, stoppable
+from study.errors import EXIT_AGAIN, EXIT_INTERRUPTED
 
 HEAVY = ("torch", "lightning", "mlflow", "optuna", "matplotlib", "highway_env", "cv2", "pandas", "distributed")
 
@@ -117,7 +118,7 @@ def test_a_time_limit_ends_the_work_with_a_code_of_its_own():
 
 def test_work_that_does_not_ask_is_left_where_it_is():
     code = (
-        "import signal, time; from study.command import stoppable\n"
+        "import signal, time; from study.console.interrupts import stoppable\n"
         "def work():\n"
         "    signal.raise_signal(signal.SIGINT)\n"
         "    time.sleep(60)\n"

@@ -5,11 +5,12 @@ from pathlib import Path
 import pytest
 
 from simulated import HEADS_GRID, World, simulate
-from study.comparison import compare, difference
-from study.config import BadInputError, Grid
-from study.markdown import markdown
-from study.report_model import checked, read_report
-from study.summary import summarise
+from study.config.grid import Grid
+from study.errors import BadInputError
+from study.report.comparison import compare, difference
+from study.report.markdown import markdown
+from study.report.model import checked, read_report
+from study.report.summary import summarise
 
 SMALL = Grid(name="small", title="Small | <b>study</b>", heads=("rec", "full"), policy_seeds=4, claims=("H4",))
 FAST = World(epochs=12)

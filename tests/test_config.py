@@ -4,19 +4,13 @@ import itertools
 
 import pytest
 
-from study.config import (
-    HEAD_SETS,
-    BadInputError,
-    Cell,
-    StudySettings,
-    cell_key,
-    encoder_key,
-    frames_key,
-    load_grid,
-    load_profile,
-    parameter_counts,
-    recording_key,
-)
+from study.config.files import load_grid, load_profile
+from study.config.grid import Cell
+from study.config.heads import HEAD_SETS
+from study.config.keys import cell_key, encoder_key, frames_key, recording_key
+from study.config.paper import parameter_counts
+from study.config.settings import StudySettings
+from study.errors import BadInputError
 
 
 def changed(**groups):

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from simulated import DATASIZE_GRID, HEADS_GRID, World, simulate
-from study import stats
-from study.config import StudySettings, load_grid
-from study.confounds import CONFOUNDS, concerned, contrasts, varied
-from study.plan import make_plan
-from study.report import build_report
-from study.summary import summarise
+from study.analysis import comparisons
+from study.analysis.confounds import CONFOUNDS, concerned, contrasts, varied
+from study.config.files import load_grid
+from study.config.settings import StudySettings
+from study.report.build import build_report
+from study.report.summary import summarise
+from study.sweep.plan import make_plan
 
 SPLIT = CONFOUNDS[0]
 FAST = World(epochs=8)
@@ -82,7 +83,7 @@ def test_what_matters_below_all_the_data_is_shown_there_only():
 
 def test_welchs_interval_covers_a_true_difference():
     rng = np.random.default_rng(0)
-    found = [stats.welch(rng.normal(0.3, 1, 15), rng.normal(0, 2, 8)) for _ in range(800)]
+    found = [comparisons.welch(rng.normal(0.3, 1, 15), rng.normal(0, 2, 8)) for _ in range(800)]
     assert 0.93 < np.mean([each.low < 0.3 < each.high for each in found]) < 0.97
 
 

@@ -7,11 +7,13 @@ from types import SimpleNamespace
 
 import pytest
 
-from study.config import BadInputError, load_profile
-from study.data import data_flow, frames_folder, main
-from study.engine.cluster import local_engine
+from study.config.files import load_profile
+from study.data.__main__ import main
+from study.data.frames import open_frames
+from study.data.prepare import data_flow, frames_folder
 from study.engine.flows import run_flow
-from study.frames import open_frames
+from study.engine.local import local_engine
+from study.errors import BadInputError
 from study.stages import data_cost
 
 SWEEPS = Path(__file__).parent.parent / "sweeps"

@@ -2,8 +2,9 @@
 
 import pytest
 
-from study.config import Cell, StudySettings
-from study.display import Display
+from study.config.grid import Cell
+from study.config.settings import StudySettings
+from study.console.display import Display
 from study.stages import CELL_STAGES, ENCODER, Work, share_done
 
 COSTS = {"a": 100.0, "b": 100.0}
@@ -14,7 +15,7 @@ LABELS = {"a": "rec 100% e0", "b": "full 100% e0", "c": "rec+plan 100% e0"}
 @pytest.fixture
 def clock(monkeypatch):
     now = [1000.0]
-    monkeypatch.setattr("study.display.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("study.console.display.time.monotonic", lambda: now[0])
     return now
 
 

@@ -18,10 +18,11 @@ import yaml
 
 from listening import listen
 from servers import free_port
-from study.config import BadInputError
-from study.engine import cluster
-from study.engine.cluster import check_address, cluster_engine, local_engine, start_jobs, visible_gpus
+from study.engine import local, remote, workers
 from study.engine.flows import TRIES, run_flow
+from study.engine.local import local_engine, visible_gpus
+from study.engine.remote import check_address, cluster_engine, start_jobs
+from study.errors import BadInputError
 from study.stages import ENCODER, Batch, Task
 
 GPU = "7"
@@ -32,9 +33,9 @@ def engine(tmp_path_factory):
     with local_engine(2, tmp_path_factory.mktemp("scratch"), [GPU]) as started:
         yield started
         alive = [child for child in psutil.Process().children() if child.status() != psutil.STATUS_ZOMBIE]
-        workers = [child for child in alive if "spawn_main" in " ".join(child.cmdline())]
-    assert workers
-    assert psutil.wait_procs(workers, timeout=30)[1] == []  # none outlives its engine
+        left = [child for child in alive if "spawn_main" in " ".join(child.cmdline())]
+    assert left
+    assert psutil.wait_procs(left, timeout=30)[1] == []  # none outlives its engine
 
 
 def flow(function, *argument_lists, **options):
@@ -129,7 +130,7 @@ def test_accelerated_tasks_run_where_the_gpu_is_seen(engine):
 
 def test_a_gpu_whose_worker_restarts_is_waited_for(engine, tmp_path, monkeypatch):
     """A cell that was to be trained on a GPU must not end up on the CPU."""
-    monkeypatch.setattr(cluster, "SIZE", 0.0)  # notices at once that the worker is gone
+    monkeypatch.setattr(workers, "SIZE", 0.0)  # notices at once that the worker is gone
     dies = flow(die, (tmp_path / "diary", 1), accelerated=True)
     waits = flow(environment, *[("CUDA_VISIBLE_DEVICES",)] * 2, accelerated=True)
     assert listen(engine, {"dies": dies, "waits": waits}).products == {"dies": ["alive"], "waits": [GPU, GPU]}
@@ -191,7 +192,7 @@ def test_other_addresses_are_refused_before_anything_is_sent(address, says):
 
 
 def test_an_address_where_nobody_answers_is_one_clear_error(monkeypatch):
-    monkeypatch.setattr(cluster, "CONNECT", 0.5)
+    monkeypatch.setattr(remote, "CONNECT", 0.5)
     with pytest.raises(BadInputError, match=r"no Dask scheduler answers at t.*start one with 'dask scheduler'"):
         cluster_engine(f"tcp://127.0.0.1:{free_port()}")
 
@@ -203,7 +204,7 @@ def test_certificates_that_are_missing_are_named(tmp_path):
 
 
 def test_certificates_that_are_none_are_one_clear_error(tmp_path, monkeypatch):
-    monkeypatch.setattr(cluster, "CONNECT", 0.5)
+    monkeypatch.setattr(remote, "CONNECT", 0.5)
     for name in ("ca.pem", "cert.pem", "key.pem"):
         (tmp_path / name).write_text("none")
     with pytest.raises(BadInputError, match="--certificates"):
@@ -278,7 +279,7 @@ def test_jobs_of_a_batch_system_work_over_tls(tmp_path, monkeypatch):
 def test_gpus_are_named_as_cuda_names_them(monkeypatch, visible, count, device, names):
     """What CUDA would count is given: there may be no GPU here."""
     monkeypatch.setattr("torch.cuda.device_count", lambda: count)
-    monkeypatch.setattr(cluster, "GPU_DRIVERS", ("/dev/null",) if count else ())
+    monkeypatch.setattr(local, "GPU_DRIVERS", ("/dev/null",) if count else ())
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     if visible is not None:
         monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)

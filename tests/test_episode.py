@@ -8,8 +8,9 @@ import pandas as pd
 import pytest
 
 from drives import crossing_drive
-from study.config import BadInputError
-from study.episode import FILES, Episode, file_digest, read_episode, write_episode
+from study.episode.files import FILES, file_digest, read_episode, write_episode
+from study.episode.schema import Episode
+from study.errors import BadInputError
 
 STATES = ("x", "y", "heading", "speed", "steering", "acceleration", "light", "light_distance", "route_s", "lead_gap")
 

@@ -15,10 +15,14 @@ import torch
 from mlflow.models import Model
 
 from simulated import HEADS_GRID, World, simulate
-from study.autoencoder import Encoder, encode, to_float
-from study.exported import export_driver
-from study.mlmodel import write_model
-from study.policy import initial_weights, normalisation, predict
+from study.driving.driver import export_driver
+from study.encoder.inputs import to_float
+from study.encoder.latents import encode
+from study.encoder.networks import Encoder
+from study.policy.draws import initial_weights
+from study.policy.latents import normalisation
+from study.policy.networks import predict
+from study.tracking.model import write_model
 
 SEEDS = 3
 

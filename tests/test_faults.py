@@ -151,7 +151,7 @@ POISON = """\
 import importlib.util, os, signal, sys
 class Finder:
     def find_spec(self, name, path=None, target=None):
-        if name != "study.autoencoder":
+        if name != "study.encoder.training":
             return None
         sys.meta_path.remove(self)
         spec = importlib.util.find_spec(name)

@@ -5,21 +5,26 @@ import numpy as np
 import pytest
 
 from simulated import DATASIZE_GRID, HEADS_GRID, World, simulate
-from study import figures, stats
-from study.config import HEAD_SETS, BadInputError, Grid
-from study.drawings import draw, draw_sweeps
-from study.summary import summarise
+from study.analysis import intervals, learning_curves
+from study.config.grid import Grid
+from study.config.heads import HEAD_SETS
+from study.errors import BadInputError
+from study.figures import curves, differences, style
+from study.report.drawings import draw, draw_sweeps
+from study.report.summary import summarise
 
 
 @pytest.fixture(scope="module")
 def bands():
     table = simulate(HEADS_GRID, World(epochs=40)).table()
-    return stats.curve_bands(table, stats.STEERING), stats.curve_bands(table, stats.ACCURACY)
+    return intervals.curve_bands(table, learning_curves.STEERING), intervals.curve_bands(
+        table, learning_curves.ACCURACY
+    )
 
 
 @pytest.fixture
 def heads_figure(bands):
-    return figures.compare_heads(*bands, steering_floor=0.004, accuracy_floor=0.34)
+    return curves.compare_heads(*bands, steering_floor=0.004, accuracy_floor=0.34)
 
 
 def texts(figure):
@@ -33,18 +38,18 @@ def luminance(colour):
 
 
 def test_every_head_set_has_a_colour_a_line_and_a_marker_of_its_own():
-    for marks in (figures.COLOUR, figures.MARKER):
+    for marks in (style.COLOUR, style.MARKER):
         assert set(marks) == set(HEAD_SETS)
         assert len(set(marks.values())) == len(HEAD_SETS)
-    assert set(figures.LINE) == set(HEAD_SETS)
+    assert set(style.LINE) == set(HEAD_SETS)
 
 
 def test_head_sets_of_similar_grey_differ_in_line_style():
     for first in HEAD_SETS:
         for second in HEAD_SETS:
-            similar = abs(luminance(figures.COLOUR[first]) - luminance(figures.COLOUR[second])) < 0.1
+            similar = abs(luminance(style.COLOUR[first]) - luminance(style.COLOUR[second])) < 0.1
             if first < second and similar:
-                assert figures.LINE[first] != figures.LINE[second]
+                assert style.LINE[first] != style.LINE[second]
 
 
 def test_curves_are_labelled_directly_and_axes_have_units(heads_figure):
@@ -64,7 +69,7 @@ def test_the_loss_axis_starts_at_zero_and_a_cut_accuracy_axis_says_so(heads_figu
 
 def test_a_floor_in_sight_is_a_line(bands):
     steering, accuracy = bands
-    figure = figures.compare_heads(steering, accuracy, steering_floor=0.001, accuracy_floor=0.8)
+    figure = curves.compare_heads(steering, accuracy, steering_floor=0.001, accuracy_floor=0.8)
     assert {"best constant ", "majority class "} <= set(texts(figure))
 
 
@@ -78,7 +83,7 @@ def test_lines_show_the_means_they_are_given(bands, heads_figure):
 def test_labels_at_the_ends_do_not_touch(bands):
     steering, accuracy = bands
     same = accuracy.assign(mean=0.8 + 0.001 * accuracy["epoch"])
-    figure = figures.compare_heads(steering, same, 0.004, 0.34)
+    figure = curves.compare_heads(steering, same, 0.004, 0.34)
     axes = figure.axes[1]
     heights = sorted(text.get_position()[1] for text in axes.texts if text.get_text() in HEAD_SETS)
     assert min(np.diff(heights)) > 0.05
@@ -86,8 +91,8 @@ def test_labels_at_the_ends_do_not_touch(bands):
 
 def test_a_figure_is_the_same_bytes_each_time(bands, tmp_path):
     for folder in ("one", "two"):
-        figure = figures.compare_heads(*bands, steering_floor=0.004, accuracy_floor=0.34)
-        figures.save(figure, tmp_path / folder, "f")
+        figure = curves.compare_heads(*bands, steering_floor=0.004, accuracy_floor=0.34)
+        style.save(figure, tmp_path / folder, "f")
     for kind in ("svg", "png"):
         one, two = ((tmp_path / folder / f"f.{kind}").read_bytes() for folder in ("one", "two"))
         assert one == two
@@ -95,7 +100,7 @@ def test_a_figure_is_the_same_bytes_each_time(bands, tmp_path):
 
 
 def test_saved_files_are_svg_and_png_and_nothing_is_left_beside_them(heads_figure, tmp_path):
-    vector, raster = figures.save(heads_figure, tmp_path, "f")
+    vector, raster = style.save(heads_figure, tmp_path, "f")
     assert ET.parse(vector).getroot().tag.endswith("svg")  # noqa: S314 - our own file
     assert raster.read_bytes().startswith(b"\x89PNG")
     assert {path.name for path in tmp_path.iterdir()} == {"f.svg", "f.png"}
@@ -105,7 +110,7 @@ def test_a_figure_is_written_whole_in_the_format_of_its_ending(tmp_path):
     for ending, start in ((".svg", b"<?xml"), (".PNG", b"\x89PNG"), (".pdf", b"%PDF")):
         made = []
         for name in ("one", "two"):
-            figures.write(figures.confusions([("rec", np.eye(3))]), tmp_path / f"{name}{ending}")
+            style.write(differences.confusions([("rec", np.eye(3))]), tmp_path / f"{name}{ending}")
             made.append((tmp_path / f"{name}{ending}").read_bytes())
         assert made[0].startswith(start)
         assert made[0] == made[1]
@@ -114,7 +119,7 @@ def test_a_figure_is_written_whole_in_the_format_of_its_ending(tmp_path):
 
 def test_picture_rows_place_a_picture_of_each_row_in_each_column():
     pictures = np.arange(3, dtype=np.uint8)[:, None, None] * np.ones((3, 64, 64), np.uint8)
-    figure = figures.picture_rows([("input", pictures), ("", pictures), ("target", pictures)])
+    figure = pictures.picture_rows([("input", pictures), ("", pictures), ("target", pictures)])
     assert [axes.images[0].get_array().shape[:2] for axes in figure.axes] == [(200, 600)] * 2
     assert [text.get_text() for text in figure.texts] == ["input", "target"]
 
@@ -210,7 +215,7 @@ def test_two_sweeps_differ_by_marker_and_fill_and_share_the_head_sets_colours(tw
     }
     assert marks(right) == gains
     coloured = {line.get_color() for line in left.lines if line.get_marker() in ("o", "D")}
-    assert coloured == set(figures.COLOUR.values())
+    assert coloured == set(style.COLOUR.values())
 
 
 def test_two_sweeps_have_a_row_for_each_head_set_and_fraction_and_a_bar_for_each_interval(two, reports):
@@ -252,7 +257,7 @@ def test_one_score_without_interval_is_drawn_and_no_score_is_refused(tmp_path):
     one = report_of(grid)
     assert math.isnan(one.scores[0].accuracy.low)
     drawing = draw_sweeps(one, one, ("a" * 200, "b"))
-    figures.write(drawing.figure, tmp_path / "one.png")
+    style.write(drawing.figure, tmp_path / "one.png")
     (axes,) = drawing.figure.axes
     assert not any(
         math.isfinite(x) for bars in axes.collections for path in bars.get_paths() for x in path.vertices[:, 0]

@@ -7,9 +7,9 @@ from collections import deque
 import pytest
 
 from listening import listen
-from study.config import BadInputError, TrainingDivergedError
 from study.engine.flows import TRIES, FlowFailedError, run_flow
 from study.engine.tasks import perform
+from study.errors import BadInputError, TrainingDivergedError
 from study.stages import ENCODER, LATENTS, POLICY, Batch, Task
 
 RETRIED = [OSError("the disk is away"), MemoryError(), RuntimeError("CUDA out of memory. Tried to allocate 2 GiB")]

@@ -13,13 +13,16 @@ import numpy as np
 import pytest
 
 from drives import write_drives
-from study.birdview import render_birdview
-from study.config import FORMAT_VERSIONS, BadInputError, BirdviewSettings, FramesSettings
-from study.engine.cluster import local_engine
+from study.config.keys import FORMAT_VERSIONS
+from study.config.settings import BirdviewSettings, FramesSettings
+from study.data.birdview import render_birdview
+from study.data.build import frames_flow
+from study.data.frames import epoch_order, open_frames, unpack_masks
+from study.data.selection import LABELS
 from study.engine.flows import run_flow
-from study.episode import episode_digest, read_episode
-from study.frames import epoch_order, frames_flow, open_frames, unpack_masks
-from study.selection import LABELS
+from study.engine.local import local_engine
+from study.episode.files import episode_digest, read_episode
+from study.errors import BadInputError
 
 FRAMES = FramesSettings(encoder=120, policy=60, spacing=0.5)
 VIEW = BirdviewSettings()
@@ -95,10 +98,10 @@ KILLED = """
 import os, signal, sys
 from contextlib import nullcontext
 from pathlib import Path
-from study.config import BirdviewSettings, FramesSettings
-from study.engine.cluster import local_engine
+from study.config.settings import BirdviewSettings, FramesSettings
+from study.engine.local import local_engine
 from study.engine.flows import run_flow
-from study.frames import frames_flow
+from study.data.build import frames_flow
 
 def progress(stage, done, total):
     if stage == sys.argv[2] and done >= int(sys.argv[3]):

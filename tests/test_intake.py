@@ -9,13 +9,12 @@ import pytest
 
 from running import store
 from simulated import EPISODES, FRAMES, World, simulate_cell
-from study.command import EXIT_INTERRUPTED
-from study.config import BadInputError
-from study.intake import planned_results, take_in
-from study.plan import make_plan
-from study.result import load_results
-from study.sweep import main
-from study.tracking import Tracker
+from study.errors import EXIT_INTERRUPTED, BadInputError
+from study.results.cell_result import load_results
+from study.sweep.__main__ import main
+from study.sweep.offline_results import planned_results, take_in
+from study.sweep.plan import make_plan
+from study.tracking.tracker import Tracker
 
 PLAN = (
     "heads",
@@ -39,7 +38,7 @@ def plan():
 
 @pytest.fixture(scope="module")
 def trained(plan, tmp_path_factory):
-    """What study.train leaves."""
+    """What study.sweep train leaves."""
     folder = tmp_path_factory.mktemp("trained")
     rng = np.random.default_rng(0)
     labels = (

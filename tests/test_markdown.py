@@ -6,12 +6,13 @@ import pytest
 from pypdf import PdfReader
 
 from simulated import DATASIZE_GRID, HEADS_GRID, World, simulate
-from study.config import Grid, StudySettings
-from study.markdown import markdown
-from study.report import build_report
-from study.report_text import document
-from study.rounding import between, epochs, fixed, percent, points
-from study.summary import summarise
+from study.config.grid import Grid
+from study.config.settings import StudySettings
+from study.report.build import build_report
+from study.report.markdown import markdown
+from study.report.rounding import between, epochs, fixed, percent, points
+from study.report.summary import summarise
+from study.report.text import document
 
 
 @pytest.fixture(scope="module")

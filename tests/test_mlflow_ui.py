@@ -19,10 +19,10 @@ import torch
 from browser import Browser, program
 from servers import LOOPBACK, TrackingServer
 from simulated import HEADS_GRID, World, simulate
-from study.card import card_files
-from study.exported import export_driver
-from study.frames import open_frames
-from study.tracking import Tracker
+from study.data.card import card_files
+from study.data.frames import open_frames
+from study.driving.driver import export_driver
+from study.tracking.tracker import Tracker
 
 pytestmark = pytest.mark.slow
 

@@ -4,10 +4,10 @@ import shlex
 
 import pytest
 
-from study.config import BadInputError
-from study.plan import given_plan
-from study.provenance import cores
-from study.sweep import main, parser
+from study.compute.provenance import cores
+from study.errors import BadInputError
+from study.sweep.__main__ import main, parser
+from study.sweep.plan import given_plan
 
 
 def test_threads_do_not_depend_on_the_number_of_workers():

@@ -13,28 +13,15 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from study import policy
-from study.config import BadInputError, PolicySettings, TrainingDivergedError
-from study.policy import (
-    METRICS,
-    WIDTHS,
-    Labels,
-    Layer,
-    Scratch,
-    TrainedPolicies,
-    draw_epoch,
-    dropped,
-    forward_backward,
-    initial_weights,
-    join_policies,
-    likeliest,
-    measure,
-    normalisation,
-    normalise,
-    predict,
-    train_policies,
-)
-from study.result import CURVE_COLUMNS
+from study.config.settings import PolicySettings
+from study.errors import BadInputError, TrainingDivergedError
+from study.policy import ensemble
+from study.policy.draws import draw_epoch, initial_weights
+from study.policy.latents import normalisation, normalise
+from study.policy.metrics import METRICS, Labels, likeliest, measure
+from study.policy.networks import WIDTHS, Layer, Scratch, dropped, forward_backward, predict
+from study.policy.training import TrainedPolicies, join_policies, train_policies
+from study.results.cell_result import CURVE_COLUMNS
 from waiting import questions
 
 SETTINGS = PolicySettings(epochs=5, batch=64, lr=5e-3)
@@ -114,7 +101,7 @@ def test_all_seeds_as_one_group_come_out_as_one_group_each(
     fifteen: TrainedPolicies, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The way of a GPU, taken on a CPU."""
-    monkeypatch.setattr(policy, "_groups", lambda seeds, device: [slice(0, seeds)])
+    monkeypatch.setattr(ensemble, "_groups", lambda seeds, device: [slice(0, seeds)])
     together = train(range(15))
     np.testing.assert_allclose(together.steering, fifteen.steering, rtol=1e-3, atol=1e-4)
     np.testing.assert_allclose(
@@ -124,8 +111,8 @@ def test_all_seeds_as_one_group_come_out_as_one_group_each(
 
 def test_inside_an_epoch_nobody_waits_for_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
     """The way of a GPU: no number leaves it before the epoch's end."""
-    asked = questions(monkeypatch, policy.PolicyEnsemble, "training_step")
-    monkeypatch.setattr(policy, "_groups", lambda seeds, device: [slice(0, seeds)])
+    asked = questions(monkeypatch, ensemble.PolicyEnsemble, "training_step")
+    monkeypatch.setattr(ensemble, "_groups", lambda seeds, device: [slice(0, seeds)])
     train()
     assert asked == []
 

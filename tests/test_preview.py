@@ -7,11 +7,12 @@ import pytest
 from PIL import Image
 
 from drives import crossing_drive
-from study.birdview import Renderer
-from study.config import BadInputError, BirdviewSettings
-from study.episode import RED
-from study.frames import open_frames, unpack_masks
-from study.preview import LIGHTS, choose_ego, label_text, sample, write_film, write_preview
+from study.config.settings import BirdviewSettings
+from study.data.birdview import Renderer
+from study.data.frames import open_frames, unpack_masks
+from study.data.preview import LIGHTS, choose_ego, label_text, sample, write_film, write_preview
+from study.episode.schema import RED
+from study.errors import BadInputError
 
 VIEW = BirdviewSettings()
 

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from study.config import BadInputError
+from study.errors import BadInputError
 from study.products import read_product, write_product
 
 HEAD = {"facts": {"seconds": 1.5, "seeds": [3, 1]}, "name": "β"}

@@ -9,7 +9,7 @@ import subprocess
 
 import pytest
 
-from study.provenance import DIFF_LIMIT, ROOT, cores, provenance
+from study.compute.provenance import DIFF_LIMIT, ROOT, cores, provenance
 
 
 def git(folder, *words):

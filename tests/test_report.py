@@ -11,10 +11,11 @@ import pytest
 from pypdf import PdfReader
 
 from simulated import DATASIZE_GRID, HEADS_GRID, World, simulate
-from study import report
-from study.config import BadInputError, Grid
-from study.report import build_report
-from study.summary import summarise
+from study.config.grid import Grid
+from study.errors import BadInputError
+from study.report import __main__, build
+from study.report.build import build_report
+from study.report.summary import summarise
 
 
 def pages(pdf):
@@ -162,7 +163,7 @@ def test_the_datasize_report_has_its_claims(tmp_path):
 
 @pytest.fixture(scope="module")
 def tracker(empty_store, tmp_path_factory):
-    from study.tracking import Tracker
+    from study.tracking.tracker import Tracker
 
     return Tracker(f"sqlite:///{shutil.copy(empty_store, tmp_path_factory.mktemp('tracking'))}")
 
@@ -183,7 +184,7 @@ def committed(tracker):
 
 def test_publish_builds_from_the_tracker_alone_and_logs_what_it_made(tracker, committed, tmp_path):
     record, run = committed
-    pdf = report.publish(tracker, "pair", None, tmp_path / "reports")
+    pdf = build.publish(tracker, "pair", None, tmp_path / "reports")
     assert pdf.read_bytes() == build_report(record, tmp_path / "direct").read_bytes()
     logged = {item.path for folder in ("report", "figures") for item in tracker.client.list_artifacts(run, folder)}
     assert {"report/pair.pdf", "report/report.json", "figures/test_compare_heads.svg"} <= logged
@@ -207,21 +208,21 @@ def test_a_sweep_that_varies_one_setting_is_found_and_takes_nobodys_place(tracke
     back = tracker.read_variants(tracker.read_sweep("pair-split"))
     assert {name: one.grid.name for name, one in back.items()} == {"frames.split": "pair"}
     assert tracker.read_sweep("pair").settings == record.settings
-    assert report.main(["pair", "--format", "md", "--tracking", tracker.uri]) == 0
+    assert __main__.main(["pair", "--format", "md", "--tracking", tracker.uri]) == 0
     assert "`frames.split`: episode here, frame in `pair-split`" in capsys.readouterr().out
 
 
 def test_compare_takes_files_folders_and_sweeps_in_mlflow(tracker, committed, tmp_path, capsys):
     (tmp_path / "report.json").write_bytes(summarise(committed[0]).json())
     for other in (tmp_path / "report.json", f"pair@{tracker.uri}", f"pair:laptop@{tracker.uri}"):
-        assert report.main(["compare", str(tmp_path), str(other)]) == 0
+        assert __main__.main(["compare", str(tmp_path), str(other)]) == 0
         assert "rec (the same result), full (the same result)" in capsys.readouterr().out
     with pytest.raises(BadInputError, match=r"no sweep 'pair \(paper\)'"):
-        report.main(["compare", str(tmp_path), "pair:paper", "--tracking", tracker.uri])
+        __main__.main(["compare", str(tmp_path), "pair:paper", "--tracking", tracker.uri])
     with pytest.raises(BadInputError, match=r"cannot read nowhere/report\.json"):
-        report.main(["compare", str(tmp_path), "nowhere/report.json"])
+        __main__.main(["compare", str(tmp_path), "nowhere/report.json"])
     with pytest.raises(BadInputError, match="compare A B"):
-        report.main(["compare", str(tmp_path)])
+        __main__.main(["compare", str(tmp_path)])
 
 
 def test_compare_draws_into_the_file_that_it_is_given(committed, tmp_path, capsys, monkeypatch):
@@ -229,7 +230,7 @@ def test_compare_draws_into_the_file_that_it_is_given(committed, tmp_path, capsy
     (tmp_path / "report.json").write_bytes(summarise(committed[0]).json())
     (tmp_path / "my pictures").mkdir()
     for file, shown in ((Path("my pictures/a.svg"), "![Dot plot"), (tmp_path / "my pictures" / "b.pdf", "\n[Dot plot")):
-        assert report.main(["compare", ".", ".", "--figure", str(file)]) == 0
+        assert __main__.main(["compare", ".", ".", "--figure", str(file)]) == 0
         text = capsys.readouterr().out
         assert shown in text
         assert f"](my%20pictures/{file.name})" in text
@@ -252,20 +253,20 @@ def test_a_figure_that_cannot_be_is_refused_before_anything_is_read(words, messa
     monkeypatch.chdir(tmp_path)
     (tmp_path / "folder.png").mkdir()
     with pytest.raises(BadInputError, match=message):
-        report.main(words)
+        __main__.main(words)
     assert [path.name for path in tmp_path.iterdir()] == ["folder.png"]
 
 
 def test_format_md_prints_tables_and_writes_nothing(tracker, committed, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert report.main(["pair", "--format", "md", "--tracking", tracker.uri]) == 0
+    assert __main__.main(["pair", "--format", "md", "--tracking", tracker.uri]) == 0
     assert "| full | 3 |" in capsys.readouterr().out
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_sweep_that_was_never_run_is_bad_input(tracker, tmp_path):
     with pytest.raises(BadInputError, match="no sweep 'heads'"):
-        report.publish(tracker, "heads", None, tmp_path)
+        build.publish(tracker, "heads", None, tmp_path)
 
 
 def test_the_command_says_what_is_wrong_and_exits_with_2(tracker):

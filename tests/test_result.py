@@ -7,8 +7,8 @@ import pandas as pd
 import pytest
 
 from simulated import simulate
-from study.config import BadInputError
-from study.result import ARRAYS, TABLE_COLUMNS, CellResult
+from study.errors import BadInputError
+from study.results.cell_result import ARRAYS, TABLE_COLUMNS, CellResult
 
 
 @pytest.fixture(scope="module")

@@ -6,10 +6,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from study.adapt import adapt
-from study.birdview import Renderer, valid_moments
-from study.config import load_profile
-from study.episode import check_episode
+from study.config.files import load_profile
+from study.data.birdview import Renderer, valid_moments
+from study.episode.adapt import adapt
+from study.episode.checks import check_episode
 from study.sim.scenes import SCENES, SHORTEST, record_scene
 
 

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from drives import write_drives
-from study.config import BadInputError, BirdviewSettings, FramesSettings
-from study.episode import read_episode
-from study.selection import LABELS, STANDING, candidates, choose, histograms, rake
+from study.config.settings import BirdviewSettings, FramesSettings
+from study.data.selection import LABELS, STANDING, candidates, choose, histograms, rake
+from study.episode.files import read_episode
+from study.errors import BadInputError
 
 VIEW = BirdviewSettings()
 STEERING = np.array([0.1, 0.1, 0.1, 0.4, 0.1, 0.1, 0.1])

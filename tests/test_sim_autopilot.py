@@ -5,11 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from study.config import ACCELERATIONS, TownSettings
-from study.episode import GREEN, RED
+from study.config.paper import ACCELERATIONS
+from study.config.settings import TownSettings
+from study.episode.schema import GREEN, RED
 from study.sim.autopilot import DT
 from study.sim.env import Traffic, make_traffic
-from study.sim.town import LENGTH
+from study.sim.geometry import LENGTH
 
 
 @dataclass

@@ -8,7 +8,9 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from highway_env.road.road import RoadNetwork
 
-from study.config import ACCELERATIONS, BadInputError, TownSettings
+from study.config.paper import ACCELERATIONS
+from study.config.settings import TownSettings
+from study.errors import BadInputError
 from study.sim.autopilot import DT, REACH
 from study.sim.env import EGO, TownEnv, Traffic, make_traffic
 

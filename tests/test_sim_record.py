@@ -6,9 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from study.config import ACCELERATIONS, BadInputError, RecordingSettings, TownSettings
+from study.config.paper import ACCELERATIONS
+from study.config.settings import RecordingSettings, TownSettings
 from study.engine.flows import run_flow
-from study.episode import Episode, check_episode, read_episode
+from study.episode.checks import check_episode
+from study.episode.files import read_episode
+from study.episode.schema import Episode
+from study.errors import BadInputError
 from study.sim.autopilot import LOOK
 from study.sim.record import FORMAT_VERSION, record_episode, record_flow
 

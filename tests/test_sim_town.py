@@ -5,10 +5,12 @@ import itertools
 import numpy as np
 import pytest
 
-from study.config import BadInputError, TownSettings
-from study.episode import GREEN, RED, YELLOW
+from study.config.settings import TownSettings
+from study.episode.schema import GREEN, RED, YELLOW
+from study.errors import BadInputError
+from study.sim.geometry import LANE_WIDTH
 from study.sim.lights import plan_lights
-from study.sim.town import LANE_WIDTH, Town, draw_town, highway_lane
+from study.sim.town import Town, draw_town, highway_lane
 
 SEEDS = range(12)
 

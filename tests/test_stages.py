@@ -2,7 +2,8 @@
 
 import pytest
 
-from study.config import Cell, StudySettings
+from study.config.grid import Cell
+from study.config.settings import StudySettings
 from study.stages import CELL_STAGES, DATA_STAGES, Cost, Work, cell_cost, clock, data_cost, share_done, size, total
 
 

@@ -7,10 +7,12 @@ import pandas as pd
 import pytest
 
 from drives import write_drives
-from study.config import FORMAT_VERSIONS, BadInputError, BirdviewSettings, FramesSettings
-from study.episode import episode_digest, read_episode
-from study.selection import candidates
-from study.state import true_state
+from study.config.keys import FORMAT_VERSIONS
+from study.config.settings import BirdviewSettings, FramesSettings
+from study.data.selection import candidates
+from study.data.true_state import true_state
+from study.episode.files import episode_digest, read_episode
+from study.errors import BadInputError
 
 COUNT = 3
 

@@ -11,9 +11,9 @@ from sklearn import linear_model, preprocessing
 from statsmodels.stats.weightstats import DescrStatsW
 
 from simulated import DATASIZE_GRID, HEADS_GRID, Null, World, simulate
-from study import stats
-from study.points import scores_of
-from study.result import TABLE_COLUMNS
+from study.analysis import comparisons, convergence, intervals, learning_curves, predictions
+from study.results.cell_result import TABLE_COLUMNS
+from study.tracking.metrics import scores_of
 
 PAIR = HEADS_GRID.model_copy(update={"heads": ("rec", "full")})
 DIFFERENCES = np.array([0.4, -0.1, 0.9, 0.3, 1.4, -0.6, 0.8, 0.2])
@@ -44,25 +44,25 @@ def test_final_scores_are_means_of_the_last_epochs_of_each_seed(record):
         (table["heads"] == "full")
         & (table["policy_seed"] == 3)
         & (table["split"] == "test")
-        & (table["metric"] == stats.ACCURACY)
+        & (table["metric"] == learning_curves.ACCURACY)
         & (table["epoch"] > 95)
     ]
     assert len(one) == 5
-    assert full.loc[3, stats.ACCURACY] == pytest.approx(one["value"].mean())
+    assert full.loc[3, learning_curves.ACCURACY] == pytest.approx(one["value"].mean())
     assert [each.shape for each in scores.values()] == [(15, 4)] * 5  # seeds and metrics of each cell and the ceiling
 
 
 def test_a_panel_does_not_depend_on_the_order_of_the_rows(record):
     table = record.table()
     shuffled = table.sample(frac=1, random_state=1)
-    left, right = (stats.panel(rows, stats.ACCURACY) for rows in (table, shuffled))
+    left, right = (learning_curves.panel(rows, learning_curves.ACCURACY) for rows in (table, shuffled))
     assert set(left) == set(right)
     for point, curves in left.items():
         pd.testing.assert_frame_equal(curves, right[point])
 
 
 def test_bands_contain_the_mean_and_the_interval_is_inside_the_band(record):
-    bands = stats.curve_bands(record.table(), stats.ACCURACY)
+    bands = intervals.curve_bands(record.table(), learning_curves.ACCURACY)
     assert (bands["low"] < bands["mean"]).all()
     assert (bands["mean"] < bands["high"]).all()
     assert (bands["high"] - bands["mean"] < bands["sd"]).all()
@@ -70,11 +70,11 @@ def test_bands_contain_the_mean_and_the_interval_is_inside_the_band(record):
 
 
 def test_bands_of_an_empty_table_are_empty():
-    assert stats.curve_bands(pd.DataFrame(columns=list(TABLE_COLUMNS)), stats.ACCURACY).empty
+    assert intervals.curve_bands(pd.DataFrame(columns=list(TABLE_COLUMNS)), learning_curves.ACCURACY).empty
 
 
 def test_one_seed_gives_a_mean_without_an_interval():
-    found = stats.mean_interval(stats.final(frame([[0.5, 0.7]]), last=1))
+    found = intervals.mean_interval(learning_curves.final(frame([[0.5, 0.7]]), last=1))
     assert found.value == 0.7
     assert math.isnan(found.low)
     assert found.n == 1
@@ -84,7 +84,7 @@ def test_one_seed_gives_a_mean_without_an_interval():
 
 
 def test_t_limits_are_scipys():
-    low, high = stats.t_limits(DIFFERENCES)
+    low, high = intervals.t_limits(DIFFERENCES)
     theirs = scipy_stats.ttest_1samp(DIFFERENCES, 0).confidence_interval(0.95)
     assert (low, high) == pytest.approx((theirs.low, theirs.high))
 
@@ -92,33 +92,33 @@ def test_t_limits_are_scipys():
 @pytest.mark.parametrize("n", [5, 15, 200])
 def test_the_expanded_level_makes_a_normal_bootstrap_as_long_as_students_interval(n):
     values = np.random.default_rng(n).normal(size=n)
-    low, high = scipy_stats.norm.interval(stats.expanded(n), values.mean(), values.std(ddof=0) / math.sqrt(n))
-    assert (low, high) == pytest.approx(stats.t_limits(values))
+    low, high = scipy_stats.norm.interval(intervals.expanded(n), values.mean(), values.std(ddof=0) / math.sqrt(n))
+    assert (low, high) == pytest.approx(intervals.t_limits(values))
 
 
 def test_two_values_have_an_interval_that_ends_at_them():
-    found = stats.bootstrap(np.array([1.0, 2.0]))
+    found = intervals.bootstrap(np.array([1.0, 2.0]))
     assert (found.low, found.high) == (1, 2)
 
 
 def test_equal_values_have_an_interval_of_no_length():
-    found = stats.bootstrap(np.full(5, 0.25))
+    found = intervals.bootstrap(np.full(5, 0.25))
     assert (found.low, found.value, found.high) == (0.25, 0.25, 0.25)
 
 
 def test_the_interquartile_mean_drops_a_quarter_on_either_side():
-    assert stats.interquartile_mean(np.array([-100.0, 1, 2, 3, 4, 5, 6, 900])) == pytest.approx(3.5)
+    assert intervals.interquartile_mean(np.array([-100.0, 1, 2, 3, 4, 5, 6, 900])) == pytest.approx(3.5)
 
 
 def test_several_encoders_are_the_units_of_the_interval():
     rng = np.random.default_rng(0)
     encoder = rng.normal(0, 1, 5).repeat(15)
     curves = frame((encoder + rng.normal(0, 0.01, 75))[:, None], encoders=5)
-    found = stats.mean_interval(stats.final(curves))
-    naive = stats.bootstrap(stats.final(curves).to_numpy())
+    found = intervals.mean_interval(learning_curves.final(curves))
+    naive = intervals.bootstrap(learning_curves.final(curves).to_numpy())
     assert found.n == 5
     assert found.high - found.low > 3 * (naive.high - naive.low)
-    both = stats.hierarchical(stats.final(curves))
+    both = intervals.hierarchical(learning_curves.final(curves))
     assert both.low < found.value < both.high
     assert both.high - both.low > 2 * (naive.high - naive.low)
 
@@ -126,9 +126,9 @@ def test_several_encoders_are_the_units_of_the_interval():
 def test_variance_components_are_those_that_made_the_data():
     rng = np.random.default_rng(1)
     values = rng.normal(0, 0.3, (200, 1, 1)) + rng.normal(0, 0.2, (200, 5, 1)) + rng.normal(0, 0.1, (200, 5, 5))
-    found = stats.variance_components(frame(values.reshape(1000, 5), encoders=200))
+    found = intervals.variance_components(frame(values.reshape(1000, 5), encoders=200))
     assert found == pytest.approx({"encoder": 0.3, "policy": 0.2, "epoch": 0.1}, rel=0.12)
-    assert math.isnan(stats.variance_components(frame(values[0]))["encoder"])
+    assert math.isnan(intervals.variance_components(frame(values[0]))["encoder"])
 
 
 def test_variance_components_are_those_of_a_mixed_model():
@@ -142,7 +142,7 @@ def test_variance_components_are_those_of_a_mixed_model():
         "value ~ 1", rows, groups="encoder", re_formula="1", vc_formula={"policy": "0 + C(policy)"}
     ).fit()
     theirs = np.sqrt([fit.cov_re.iloc[0, 0], fit.vcomp[0], fit.scale])
-    assert list(stats.variance_components(frame(values.reshape(32, 5), encoders=8)).values()) == pytest.approx(
+    assert list(intervals.variance_components(frame(values.reshape(32, 5), encoders=8)).values()) == pytest.approx(
         theirs, rel=1e-3
     )
 
@@ -150,7 +150,7 @@ def test_variance_components_are_those_of_a_mixed_model():
 def test_the_hierarchical_bootstrap_is_the_plain_loops():
     rng = np.random.default_rng(6)
     values = rng.normal(0, 1, (5, 1)) + rng.normal(0, 0.5, (5, 3))
-    ours = stats.hierarchical(stats.final(frame(values.reshape(15, 1), encoders=5), last=1))
+    ours = intervals.hierarchical(learning_curves.final(frame(values.reshape(15, 1), encoders=5), last=1))
     means = [np.mean([rng.choice(values[encoder], 3).mean() for encoder in rng.choice(5, 5)]) for _ in range(4000)]
     assert (ours.low, ours.high) == pytest.approx(np.quantile(means, [0.025, 0.975]), abs=0.08)
     nested = values.mean(axis=1).var() / 5 + values.var(axis=1).mean() / 15  # what such means vary by
@@ -164,40 +164,40 @@ def test_the_hierarchical_bootstrap_is_the_plain_loops():
 def test_the_sign_flip_test_counts_all_flips():
     signs = itertools.product((-1, 1), repeat=len(DIFFERENCES))
     larger = [abs(np.dot(sign, DIFFERENCES)) >= abs(DIFFERENCES.sum()) - 1e-12 for sign in signs]
-    assert stats.sign_flip(DIFFERENCES) == pytest.approx(np.mean(larger))
+    assert comparisons.sign_flip(DIFFERENCES) == pytest.approx(np.mean(larger))
 
 
 def test_the_sign_flip_test_is_scipys():
     theirs = scipy_stats.permutation_test((DIFFERENCES,), np.mean, permutation_type="samples", n_resamples=np.inf)
-    assert stats.sign_flip(DIFFERENCES) == pytest.approx(theirs.pvalue)
+    assert comparisons.sign_flip(DIFFERENCES) == pytest.approx(theirs.pvalue)
 
 
 def test_the_smallest_p_of_n_pairs_is_two_in_two_to_the_n():
-    assert stats.sign_flip(np.arange(1, 6, dtype=float)) == 2 / 2**5
-    assert stats.sign_flip(np.zeros(5)) == 1
+    assert comparisons.sign_flip(np.arange(1, 6, dtype=float)) == 2 / 2**5
+    assert comparisons.sign_flip(np.zeros(5)) == 1
 
 
 def test_many_pairs_are_tested_by_random_flips_close_to_t():
     values = np.random.default_rng(0).normal(0.3, 1, 60)
-    assert stats.sign_flip(values) == pytest.approx(scipy_stats.ttest_1samp(values, 0).pvalue, abs=0.01)
+    assert comparisons.sign_flip(values) == pytest.approx(scipy_stats.ttest_1samp(values, 0).pvalue, abs=0.01)
 
 
 def test_probability_of_improvement_counts_ties_half():
     first, second = np.array([1.0, 2, 2, 5]), np.array([0.0, 2, 3])
-    assert stats.improvement(first, second) == pytest.approx((1 + 2 * 1.5 + 3) / 12)
+    assert comparisons.improvement(first, second) == pytest.approx((1 + 2 * 1.5 + 3) / 12)
 
 
 def test_one_value_shows_nothing():
-    assert math.isnan(stats.detectable(DIFFERENCES[:2]))
-    assert stats.equivalence(DIFFERENCES[:1], 1.0) == 1
-    assert stats.equivalence(np.full(3, 0.5), 1.0) == 0
-    assert stats.equivalence(np.full(3, 0.5), 0.5) == 1
-    assert math.isnan(stats.welch([1.0], [2.0, 3.0]).low)
+    assert math.isnan(comparisons.detectable(DIFFERENCES[:2]))
+    assert comparisons.equivalence(DIFFERENCES[:1], 1.0) == 1
+    assert comparisons.equivalence(np.full(3, 0.5), 1.0) == 0
+    assert comparisons.equivalence(np.full(3, 0.5), 0.5) == 1
+    assert math.isnan(comparisons.welch([1.0], [2.0, 3.0]).low)
 
 
 def test_only_seeds_that_both_have_are_paired():
     first, second = frame([[1.0], [2.0], [3.0]])[1], frame([[1.0], [1.0]])[1]
-    assert stats.paired(first, second).tolist() == [0, 1]
+    assert comparisons.paired(first, second).tolist() == [0, 1]
 
 
 # --- convergence ----------------------------------------------------------------------------------------------------
@@ -205,24 +205,24 @@ def test_only_seeds_that_both_have_are_paired():
 
 def test_first_reach_is_an_epoch_from_one_or_never():
     curve = np.array([0.1, 0.5, 0.4, 0.8])
-    assert stats.first_reach(curve, 0.5) == 2
-    assert stats.first_reach(curve, 0.05) == 1
-    assert stats.first_reach(curve, 0.9) == np.inf
+    assert convergence.first_reach(curve, 0.5) == 2
+    assert convergence.first_reach(curve, 0.05) == 1
+    assert convergence.first_reach(curve, 0.9) == np.inf
 
 
 def test_epochs_to_reach_follow_the_mean_curve_and_lie_in_their_interval():
     record = simulate(HEADS_GRID)
-    curves = stats.panel(record.table(), stats.ACCURACY)
+    curves = learning_curves.panel(record.table(), learning_curves.ACCURACY)
     rec, full = curves["rec", 1.0], curves["full", 1.0]
-    found = stats.epochs_to_reach(full, rec)
-    assert full.mean()[found.value] >= stats.final(rec).mean() > full.mean()[found.value - 1]
+    found = convergence.epochs_to_reach(full, rec)
+    assert full.mean()[found.value] >= learning_curves.final(rec).mean() > full.mean()[found.value - 1]
     assert found.low <= found.value <= found.high
-    assert found.value < stats.epochs_to_reach(rec, rec).value
+    assert found.value < convergence.epochs_to_reach(rec, rec).value
 
 
 def test_the_interval_of_epochs_to_reach_is_the_plain_loops():
     record = simulate(HEADS_GRID.model_copy(update={"encoder_seeds": 4, "policy_seeds": 3}))
-    curves = stats.panel(record.table(), stats.ACCURACY)
+    curves = learning_curves.panel(record.table(), learning_curves.ACCURACY)
     rec, full = curves["rec", 1.0], curves["full", 1.0]
     slow, fast = (curve.to_numpy().reshape(4, 3, -1) for curve in (rec, full))
     rng, epochs = np.random.default_rng(0), []
@@ -231,20 +231,20 @@ def test_the_interval_of_epochs_to_reach_is_the_plain_loops():
         goal = np.mean([slow[seed][-5:] for seed in seeds])
         above = np.mean([fast[seed] for seed in seeds], axis=0) >= goal
         epochs.append(above.argmax() + 1 if above.any() else np.inf)
-    found = stats.epochs_to_reach(full, rec)
+    found = convergence.epochs_to_reach(full, rec)
     assert (found.low, found.high) == pytest.approx(np.quantile(epochs, [0.025, 0.975]), abs=1)
 
 
 def test_a_curve_that_never_reaches_is_infinite_and_so_is_its_interval():
     low, high = (frame(np.full((6, 10), value)) for value in (0.5, 0.6))
-    found = stats.epochs_to_reach(low, high)
+    found = convergence.epochs_to_reach(low, high)
     assert (found.value, found.low, found.high) == (np.inf, np.inf, np.inf)
 
 
 def test_a_seed_has_reached_a_target_only_when_it_stays_there():
     spike = [0, 9, 9, 0, 0, 0, 9, 9, 9, 9]
     never = [0] * 10
-    found = stats.reach_by_seed(frame([spike, never]), target=5, window=2)
+    found = convergence.reach_by_seed(frame([spike, never]), target=5, window=2)
     assert found.epochs.tolist() == [8, np.inf]
     assert found.share == 0.5
 
@@ -254,7 +254,7 @@ def test_the_median_epoch_is_kaplan_meiers():
     curves = frame((np.arange(1, 16) >= epochs[:, None]).astype(float))
     censored = frame(np.vstack([curves.to_numpy(), np.zeros((2, 15))]))
     for rows, reached in ((curves, 5), (censored, 5)):
-        found = stats.reach_by_seed(rows, target=1.0, window=1)
+        found = convergence.reach_by_seed(rows, target=1.0, window=1)
         times = np.where(np.isfinite(found.epochs), found.epochs, 15)
         theirs = sm.SurvfuncRight(times, np.isfinite(found.epochs)).quantile(0.5)
         assert found.median == theirs
@@ -265,10 +265,10 @@ def test_the_median_epoch_is_kaplan_meiers():
 def test_the_variance_ratio_finds_the_noisier_curves():
     rng = np.random.default_rng(2)
     quiet, loud = rng.normal(0, 1, (15, 40)), rng.normal(0, 3, (15, 40))
-    found = stats.spread_ratio(frame(loud), frame(quiet), epochs=20)
+    found = convergence.spread_ratio(frame(loud), frame(quiet), epochs=20)
     assert found.low < 9 < found.high
     assert found.low > 4
-    back = stats.spread_ratio(frame(quiet), frame(loud), epochs=20)
+    back = convergence.spread_ratio(frame(quiet), frame(loud), epochs=20)
     assert back.value == pytest.approx(1 / found.value)
 
 
@@ -281,7 +281,7 @@ def test_the_variance_ratio_is_numpys_and_its_interval_the_jackknifes():
 
     everyone = list(range(15))
     pseudo = [15 * log_ratio(everyone) - 14 * log_ratio([k for k in everyone if k != out]) for out in everyone]
-    found = stats.spread_ratio(frame(loud), frame(quiet), epochs=20)
+    found = convergence.spread_ratio(frame(loud), frame(quiet), epochs=20)
     assert math.log(found.value) == pytest.approx(log_ratio(everyone))
     assert np.log([found.low, found.high]) == pytest.approx(DescrStatsW(pseudo).tconfint_mean())
 
@@ -289,7 +289,7 @@ def test_the_variance_ratio_is_numpys_and_its_interval_the_jackknifes():
 def test_the_transient_ends_when_most_of_the_rise_is_done():
     epoch = np.arange(1, 101)
     curves = frame(np.tile(1 - np.exp(-epoch / 10), (3, 1)))
-    assert stats.transient(curves) == pytest.approx(31, abs=1)  # exp(-30 / 10) = 0.05
+    assert convergence.transient(curves) == pytest.approx(31, abs=1)  # exp(-30 / 10) = 0.05
 
 
 # --- predictions ----------------------------------------------------------------------------------------------------
@@ -298,27 +298,27 @@ def test_the_transient_ends_when_most_of_the_rise_is_done():
 def test_the_best_constant_command_is_no_worse_than_any_on_a_grid():
     labels = np.random.default_rng(0).normal(0.02, 0.1, 200)
     others = [scipy.special.huber(1, labels - constant).mean() for constant in np.linspace(-0.3, 0.3, 61)]
-    assert stats.steering_floor(labels) <= min(others) + 1e-12
+    assert predictions.steering_floor(labels) <= min(others) + 1e-12
 
 
 def test_recall_and_f1_of_a_known_table():
     label = np.array([0, 0, 0, 0, 1, 1, 2, 2], np.uint8)
     guess = np.array([[0, 0, 0, 1, 1, 1, 2, 0]], np.uint8)
-    assert np.diag(stats.confusion(guess, label)[0]).tolist() == [0.75, 1, 0.5]
+    assert np.diag(predictions.confusion(guess, label)[0]).tolist() == [0.75, 1, 0.5]
     f1 = np.mean([2 * 3 / (4 + 4), 2 * 2 / (3 + 2), 2 * 1 / (1 + 2)])
-    assert stats.macro_f1(guess, label) == pytest.approx([f1])
+    assert predictions.macro_f1(guess, label) == pytest.approx([f1])
 
 
 def test_accuracy_by_drive_gives_every_drive_the_same_weight():
     label = np.array([0, 0, 0, 1], np.uint8)
     guess = np.array([[0, 0, 0, 0], [0, 0, 1, 1]], np.uint8)
-    drives = stats.episode_accuracy(guess, label, np.array([7, 7, 7, 9], np.int32))
+    drives = predictions.episode_accuracy(guess, label, np.array([7, 7, 7, 9], np.int32))
     assert drives.to_dict() == pytest.approx({7: 5 / 6, 9: 0.5})
 
 
 def test_data_fractions_keep_their_cells_apart():
     record = simulate(DATASIZE_GRID, World(epochs=6))
-    assert set(stats.panel(record.table(), stats.ACCURACY)) == {
+    assert set(learning_curves.panel(record.table(), learning_curves.ACCURACY)) == {
         (heads, fraction) for heads in ("rec", "full") for fraction in DATASIZE_GRID.fractions
     }
 
@@ -330,10 +330,10 @@ def test_a_probe_finds_what_a_latent_holds_and_nothing_where_there_is_nothing():
     rng = np.random.default_rng(0)
     z, drive = rng.normal(size=(800, 64)).astype(np.float32), np.arange(800) // 40
     held = z[:, 3] * 2.0 + 5
-    assert stats.probe(z, held, drive) > 0.95
-    assert stats.probe(z, rng.normal(size=800), drive) < 0.05
-    assert math.isnan(stats.probe(z, np.ones(800), drive))
-    assert math.isnan(stats.probe(z, held, np.zeros(800, int)))
+    assert predictions.probe(z, held, drive) > 0.95
+    assert predictions.probe(z, rng.normal(size=800), drive) < 0.05
+    assert math.isnan(predictions.probe(z, np.ones(800), drive))
+    assert math.isnan(predictions.probe(z, held, np.zeros(800, int)))
 
 
 def test_a_probe_is_scikit_learns_ridge_on_held_out_drives():
@@ -342,12 +342,12 @@ def test_a_probe_is_scikit_learns_ridge_on_held_out_drives():
     target = z[:, 0] + rng.normal(size=300)
     x = preprocessing.StandardScaler().fit_transform(z.astype(float))
     error = total = 0.0
-    for held in np.array_split(stats.generator("probe").permutation(10), 5):
+    for held in np.array_split(intervals.generator("probe").permutation(10), 5):
         test = np.isin(drive, held)
         fit = linear_model.Ridge(alpha=1.0).fit(x[~test], target[~test])
         error += ((target[test] - fit.predict(x[test])) ** 2).sum()
         total += ((target[test] - target[~test].mean()) ** 2).sum()
-    assert stats.probe(z, target, drive) == pytest.approx(1 - error / total, rel=1e-4)
+    assert predictions.probe(z, target, drive) == pytest.approx(1 - error / total, rel=1e-4)
 
 
 def test_a_probe_does_not_profit_from_twins_in_the_same_drive():
@@ -355,13 +355,13 @@ def test_a_probe_does_not_profit_from_twins_in_the_same_drive():
     drive = np.arange(800) // 40
     own = rng.normal(size=(20, 64))
     z = (own[drive] + 0.01 * rng.normal(size=(800, 64))).astype(np.float32)  # a latent tells the drive, nothing else
-    assert stats.probe(z, rng.normal(size=20)[drive], drive) < 0.3
+    assert predictions.probe(z, rng.normal(size=20)[drive], drive) < 0.3
 
 
 def test_principal_components_are_those_of_the_covariance():
     rng = np.random.default_rng(0)
     z = (rng.normal(size=(300, 4)) @ rng.normal(size=(4, 4))).astype(np.float32)
-    places, shares = stats.principal(z)
+    places, shares = predictions.principal(z)
     values = np.sort(np.linalg.eigvalsh(np.corrcoef(z.T)))[::-1]
     np.testing.assert_allclose(shares, (values / values.sum())[:2], rtol=1e-4)
     np.testing.assert_allclose(places.var(axis=0, ddof=0), values[:2], rtol=1e-3)
@@ -382,11 +382,12 @@ def covers(intervals, truth):
 @pytest.mark.parametrize(("n", "expected"), [(5, 0.92), (15, 0.945)])
 def test_bca_intervals_cover_the_mean_about_as_often_as_they_say(n, expected, monkeypatch):
     """Without the expanded level it would be 0.85 and 0.92; Student's interval is exact."""
-    monkeypatch.setattr(stats, "DRAWS", 1000)
+    for module in (intervals, comparisons, convergence):
+        monkeypatch.setattr(module, "DRAWS", 1000)
     samples = np.random.default_rng(3).normal(1.0, 0.3, (1000, n))
-    found = [stats.bootstrap(sample) for sample in samples]
+    found = [intervals.bootstrap(sample) for sample in samples]
     assert near(covers([(item.low, item.high) for item in found], 1.0), expected, 1000)
-    low, high = stats.t_limits(samples.T)
+    low, high = intervals.t_limits(samples.T)
     assert near(np.mean((low <= 1) & (high >= 1)), 0.95, 1000)
 
 
@@ -396,12 +397,13 @@ def test_bca_intervals_cover_the_mean_about_as_often_as_they_say(n, expected, mo
 def test_with_five_encoders_of_three_policies_t_keeps_its_level_and_the_bootstrap_does_not(
     encoder, policy, expected, monkeypatch
 ):
-    monkeypatch.setattr(stats, "DRAWS", 1000)
+    for module in (intervals, comparisons, convergence):
+        monkeypatch.setattr(module, "DRAWS", 1000)
     rng, nested, t = np.random.default_rng(1), [], []
     for _ in range(400):
         values = rng.normal(0, encoder, (5, 1)) + rng.normal(0, policy, (5, 3))
-        score = stats.final(frame(values.reshape(15, 1), encoders=5), last=1)
-        for kept, found in ((nested, stats.hierarchical(score)), (t, stats.mean_interval(score))):
+        score = learning_curves.final(frame(values.reshape(15, 1), encoders=5), last=1)
+        for kept, found in ((nested, intervals.hierarchical(score)), (t, intervals.mean_interval(score))):
             kept.append((found.low, found.high))
     assert near(covers(nested, 0), expected, 400)
     assert near(covers(t, 0), 0.95, 400)
@@ -414,14 +416,18 @@ def test_with_five_encoders_of_three_policies_t_keeps_its_level_and_the_bootstra
 )
 def test_epochs_to_reach_and_variance_ratios_cover_the_truth(grid, null, monkeypatch):
     """Curves with the laptop profile's spread; full is rec and two points, so its mean curve's epoch is known."""
-    monkeypatch.setattr(stats, "DRAWS", 2000)
+    for module in (intervals, comparisons, convergence):
+        monkeypatch.setattr(module, "DRAWS", 2000)
     truth = null.mean_curve() + 0.02
-    epoch = stats.first_reach(truth, truth[-stats.LAST :].mean() - 0.02)
+    epoch = convergence.first_reach(truth, truth[-learning_curves.LAST :].mean() - 0.02)
     epochs, ratios = [], []
     for seed in range(150):
         curves = null.evidence(grid, seed).accuracy
         rec, full = curves["rec", 1.0], curves["full", 1.0] + 0.02
-        for kept, found in ((epochs, stats.epochs_to_reach(full, rec)), (ratios, stats.spread_ratio(rec, full, 60))):
+        for kept, found in (
+            (epochs, convergence.epochs_to_reach(full, rec)),
+            (ratios, convergence.spread_ratio(rec, full, 60)),
+        ):
             kept.append((found.low, found.high))
     assert 0.88 < covers(epochs, epoch) < 0.99
     assert 0.88 < covers(ratios, 1.0) < 0.99
@@ -429,7 +435,7 @@ def test_epochs_to_reach_and_variance_ratios_cover_the_truth(grid, null, monkeyp
 
 def test_sign_flips_of_nothing_have_uniform_p_values():
     rng = np.random.default_rng(0)
-    p_values = np.array([stats.sign_flip(sample) for sample in rng.standard_t(3, (2000, 10))])
+    p_values = np.array([comparisons.sign_flip(sample) for sample in rng.standard_t(3, (2000, 10))])
     for level in (0.01, 0.05, 0.25, 0.5, 0.9):
         exact = math.floor(level * 2**9) / 2**9  # p is a multiple of 2 / 2^10
         assert near(np.mean(p_values <= level), exact, 2000)
@@ -439,19 +445,19 @@ def test_holm_keeps_the_family_wise_error_of_all_pairs_of_four():
     rng, wrong = np.random.default_rng(1), 0
     for _ in range(1000):
         groups = rng.normal(0, 1, (4, 10))
-        p_values = [stats.sign_flip(a - b) for a, b in itertools.combinations(groups, 2)]
+        p_values = [comparisons.sign_flip(a - b) for a, b in itertools.combinations(groups, 2)]
         wrong += len(p_values) * min(p_values) <= 0.05  # Holm's smallest p
     assert 0.01 < wrong / 1000 < 0.05 + 3 * math.sqrt(0.05 * 0.95 / 1000)
 
 
 def test_equivalence_at_the_margin_is_claimed_at_the_nominal_rate():
     samples = np.random.default_rng(2).normal(0.5, 0.4, (2000, 15))
-    claimed = np.mean([stats.equivalence(sample, 0.5) <= 0.05 for sample in samples])
+    claimed = np.mean([comparisons.equivalence(sample, 0.5) <= 0.05 for sample in samples])
     assert near(claimed, 0.05, 2000)
 
 
 def test_the_detectable_difference_is_found_four_times_in_five():
     samples = np.random.default_rng(4).normal(0, 1, (2000, 15))
-    effect = stats.detectable(scipy_stats.zscore(np.arange(15.0), ddof=1))  # of values whose sd is 1
+    effect = comparisons.detectable(scipy_stats.zscore(np.arange(15.0), ddof=1))  # of values whose sd is 1
     found = scipy_stats.ttest_1samp(samples + effect, 0, axis=1).pvalue <= 0.05
     assert near(found.mean(), 0.8, 2000)

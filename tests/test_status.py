@@ -10,9 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from study.plan import make_plan
-from study.status import SILENT, cell_statuses, main, seconds_left
-from study.tracking import Attempt, Tracker
+from study.sweep.plan import make_plan
+from study.sweep.status import SILENT, cell_statuses, main, seconds_left
+from study.tracking.cell_run import Attempt
+from study.tracking.tracker import Tracker
 
 NOW = 1_800_000_000.0
 PLAN = make_plan("heads", "laptop", {}, {})

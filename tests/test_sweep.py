@@ -10,7 +10,7 @@ from collections import Counter
 import pytest
 
 from running import FOUR, PLAN, ROOT, environment, store, sweep, working_folder
-from study.tracking import Tracker
+from study.tracking.tracker import Tracker
 
 pytestmark = pytest.mark.slow
 

@@ -18,10 +18,12 @@ import pytest
 from mlflow.artifacts import download_artifacts
 
 from servers import free_port
-from study.config import BadInputError, Cell, Grid, StudySettings, masked
-from study.result import ARRAYS, CellResult
-from study.store import SQLITE, TrackerLostError
-from study.tracking import Tracker
+from study.config.grid import Cell, Grid
+from study.config.settings import StudySettings
+from study.errors import BadInputError, masked
+from study.results.cell_result import ARRAYS, CellResult
+from study.tracking.store import SQLITE, TrackerLostError
+from study.tracking.tracker import Tracker
 
 EPOCHS, SEEDS = 6, 3
 SETTINGS = StudySettings()
@@ -594,7 +596,7 @@ def test_a_server_that_is_not_there_is_one_quick_clear_error(port):
 
 
 def test_a_server_that_never_answers_is_given_up(port, monkeypatch):
-    monkeypatch.setattr("study.store.PROBE", 0.5)
+    monkeypatch.setattr("study.tracking.store.PROBE", 0.5)
     with socket.create_server(("127.0.0.1", port)):
         started = time.monotonic()
         with pytest.raises(TrackerLostError, match="does not answer"):

@@ -9,12 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from study.command import EXIT_FAILED, Parser
-from study.config import BadInputError
-from study.plan import add_plan_options, given_plan
-from study.result import load_results
-from study.tracking import Tracker
-from study.train import EXIT_AGAIN, main
+from study.console.options import Parser
+from study.errors import EXIT_AGAIN, EXIT_FAILED, BadInputError
+from study.results.cell_result import load_results
+from study.sweep.options import add_plan_options
+from study.sweep.plan import given_plan
+from study.sweep.train import main
+from study.tracking.tracker import Tracker
 
 ROOT = Path(__file__).parent.parent
 SWEEP = ["heads", "--heads", "[rec,full]", "--policy_seeds", "2"]
@@ -108,7 +109,9 @@ def test_a_cell_that_is_there_is_not_trained_again(results):
 def test_the_limit_ends_a_piece_and_says_that_cells_are_left(home, tmp_path):
     began = time.monotonic()
     words = [*PLAN, "--encoder.epochs", "1000000", "--out", str(tmp_path), "--limit-seconds", "8"]
-    done = subprocess.run([sys.executable, "-m", "study.train", *words], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-m", "study.sweep", "train", *words], capture_output=True, text=True, check=False
+    )
     assert done.returncode == EXIT_AGAIN, done.stderr
     assert 8 <= time.monotonic() - began < 90
     assert "Traceback" not in done.stderr

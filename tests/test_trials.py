@@ -10,8 +10,8 @@ from pathlib import Path
 import optuna
 import pytest
 
-from study.config import BadInputError
 from study.engine.trials import PARAMETER, Trials
+from study.errors import BadInputError
 
 LABELS = {"k1": "rec 100% e0", "k2": "full 100% e0", "k3": "full 100% e1"}
 STUDY = "heads laptop 0123"

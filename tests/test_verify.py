@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from simulated import simulate
-from study.config import BadInputError
-from study.verify import changes, choose, differences, judge, report
+from study.errors import BadInputError
+from study.sweep.verify import changes, choose, differences, judge, report
 
 RECORD = simulate()
 RESULT = next(iter(RECORD.results.values()))

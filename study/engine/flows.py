@@ -12,10 +12,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
-from study.command import check_stopped
-from study.config import BadInputError, TrainingDivergedError
+from study.console.interrupts import check_stopped
 from study.engine.inline import InlineEngine
 from study.engine.tasks import Engine, Failure, failure_of
+from study.errors import BadInputError, TrainingDivergedError
 from study.stages import Batch, Flow, Task
 
 TRIES = 3

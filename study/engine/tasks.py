@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from study.command import WRITE_ERRORS, cannot_write
-from study.config import BadInputError, TrainingDivergedError
+from study.errors import WRITE_ERRORS, BadInputError, TrainingDivergedError, cannot_write
 from study.stages import Task
 
 NO_MEMORY = ("out of memory", "can't allocate memory")  # torch says so in RuntimeErrors, GPUs and CPUs each

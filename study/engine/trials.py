@@ -15,7 +15,7 @@ from optuna.exceptions import StorageInternalError
 from optuna.trial import Trial, TrialState
 from sqlalchemy.exc import SQLAlchemyError  # comes with optuna, which lets some of them through
 
-from study.config import BadInputError, masked
+from study.errors import BadInputError, masked
 
 PARAMETER = "cell"
 

@@ -12,9 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from study.config import ACCELERATIONS
-from study.episode import GREEN, RED, YELLOW
-from study.sim.town import LENGTH, WIDTH, Floats, Ints, Pose, Town
+from study.config.paper import ACCELERATIONS
+from study.episode.schema import GREEN, RED, YELLOW
+from study.sim.geometry import LENGTH, WIDTH, Floats, Ints, Pose
+from study.sim.town import Town
 
 DT = 0.1  # [s]
 STEERING_UNIT = 2.4  # wheel angle [rad] of a steering label of one

@@ -12,8 +12,10 @@ from highway_env.envs.common.abstract import AbstractEnv
 from highway_env.envs.common.action import ActionType
 from highway_env.envs.common.observation import ObservationType
 
-from study.config import ACCELERATIONS, BadInputError, TownSettings
-from study.episode import GREEN
+from study.config.paper import ACCELERATIONS
+from study.config.settings import TownSettings
+from study.episode.schema import GREEN
+from study.errors import BadInputError
 from study.sim.autopilot import (
     BRAKE,
     DT,
@@ -26,9 +28,10 @@ from study.sim.autopilot import (
     Decisions,
     Fleet,
 )
+from study.sim.geometry import LENGTH
 from study.sim.lights import LightPlan, plan_lights
 from study.sim.road import TownNetwork, TownRoad, TownVehicle
-from study.sim.town import LENGTH, Town, draw_town
+from study.sim.town import Town, draw_town
 
 EGO = 0  # position of the ego among the vehicles
 APART = 14.0  # vehicles start at least so far from each other [m]

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from study.config import TownSettings
-from study.episode import GREEN, RED, YELLOW
+from study.config.settings import TownSettings
+from study.episode.schema import GREEN, RED, YELLOW
 from study.sim.town import Town
 
 

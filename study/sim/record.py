@@ -11,11 +11,15 @@ from typing import Any
 import numpy as np
 from filelock import FileLock
 
-from study.config import FORMAT_VERSIONS, BadInputError, RecordingSettings, TownSettings, drive_name
-from study.episode import Agent, Episode, Lane, Light, empty_states, write_episode
+from study.config.keys import FORMAT_VERSIONS, drive_name
+from study.config.settings import RecordingSettings, TownSettings
+from study.episode.files import write_episode
+from study.episode.schema import Agent, Episode, Lane, Light, empty_states
+from study.errors import BadInputError
 from study.sim.autopilot import DT, STEERING_UNIT
 from study.sim.env import TownEnv, Traffic
-from study.sim.town import LANE_WIDTH, LENGTH, WIDTH, Floats, Town
+from study.sim.geometry import LANE_WIDTH, LENGTH, WIDTH, Floats
+from study.sim.town import Town
 from study.stages import RECORD, Batch, Flow, Task
 
 FORMAT_VERSION = FORMAT_VERSIONS["episodes"]  # raised when the same settings and seed give another drive

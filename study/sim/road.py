@@ -15,7 +15,8 @@ from highway_env.road.road import LaneIndex, Road, RoadNetwork
 from highway_env.vehicle.kinematics import Vehicle
 from numpy.typing import NDArray
 
-from study.sim.town import Floats, Ints, Pose, Town, highway_lane
+from study.sim.geometry import Floats, Ints, Pose
+from study.sim.town import Town, highway_lane
 
 CELL = 4.0  # of the grid over the town [m]
 KNOWN = 9.0  # lanes this near to a cell's centre are listed with it [m]

@@ -23,9 +23,10 @@ from highway_env.road.road import LaneIndex, RoadNetwork
 from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.controller import ControlledVehicle
 
-from study.config import BadInputError
-from study.episode import Agent, Episode, Lane, empty_states, write_episode
-from study.sim.town import LENGTH, WIDTH, Floats
+from study.episode.files import write_episode
+from study.episode.schema import Agent, Episode, Lane, empty_states
+from study.errors import BadInputError
+from study.sim.geometry import LENGTH, WIDTH, Floats
 
 SIMULATION_HZ = 15  # highway-env's own
 SHORTEST = 6.0  # a drive that ends sooner, by a crash or because all have left, is driven anew [s]

@@ -9,85 +9,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cache
 from itertools import pairwise
-from typing import Literal
 
 import numpy as np
 from highway_env.road.lane import AbstractLane, CircularLane, LineType, StraightLane
-from highway_env.road.road import LaneIndex
 from numpy.typing import NDArray
 
-from study.config import BadInputError, TownSettings
+from study.config.settings import TownSettings
+from study.errors import BadInputError
+from study.sim.geometry import CORNER, LANE_WIDTH, Floats, Piece, pose_at
+from study.sim.junction import Junction, Movement, Strip, draw_junction, junction_borders
 
-LANE_WIDTH = 3.5  # [m]
-CORNER = 7.0  # radius of the kerb where two streets of a junction meet [m]
 BEND = (14.0, 20.0)  # from the corner of a bend to where its arc starts [m]
 SHORTEST_STREET = 16.0  # between two stop lines [m]: two waiting vehicles
 FASTEST = 50.0  # highest speed limit [km/h]
-LENGTH, WIDTH = 5.0, 2.0  # of every vehicle [m], highway-env's
-DISCS = np.array([-LENGTH / 3, 0.0, LENGTH / 3])  # along a vehicle: three discs of COVER radius cover it [m]
-COVER = math.hypot(LENGTH / 6, WIDTH / 2)  # [m]
-SLACK = 0.3  # vehicles do not follow their lines exactly [m]
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Pose = tuple[Floats, Floats, Floats, Floats]  # of all vehicles: x, y [m], heading [rad], speed [m/s]
-Turn = Literal["left", "straight", "right"]
-
-
-@dataclass(frozen=True)
-class Piece:
-    """A stretch of constant curvature [1/m], positive to the right: pose of its start [m, rad] and length [m]."""
-
-    x: float
-    y: float
-    heading: float
-    curvature: float
-    length: float
-
-    def at(self, s: Floats) -> tuple[Floats, Floats, Floats]:
-        """Points and headings at the distances `s` [m] from the start."""
-        heading = self.heading + self.curvature * s
-        if self.curvature == 0:
-            return self.x + s * math.cos(self.heading), self.y + s * math.sin(self.heading), heading
-        x = self.x + (np.sin(heading) - math.sin(self.heading)) / self.curvature
-        y = self.y - (np.cos(heading) - math.cos(self.heading)) / self.curvature
-        return x, y, heading
-
-    def end(self) -> tuple[float, float, float]:
-        """Pose at the end."""
-        x, y, heading = self.at(np.array([self.length]))
-        return float(x[0]), float(y[0]), float(heading[0])
-
-    def moved(self, dx: float, dy: float) -> Piece:
-        """The same piece elsewhere."""
-        return Piece(self.x + dx, self.y + dy, self.heading, self.curvature, self.length)
-
-
-@dataclass(frozen=True)
-class Strip:
-    """A piece as a part of the map: which street or movement it belongs to, and what borders it has."""
-
-    piece: Piece
-    index: LaneIndex
-    left: str  # borders in study.episode's words
-    right: str
-    junction: bool
-    limit: float  # [m/s]
-
-
-@dataclass(frozen=True)
-class Movement:
-    """A way through a junction, from a street's lane (`entry`) over `strips` to another street's lane (`exit`)."""
-
-    node: int
-    arm: int  # where it comes from: 0 east, 1 south, 2 west, 3 north of the node
-    turn: Turn
-    entry: int
-    exit: int
-    strips: tuple[int, ...]
-    length: float
 
 
 @dataclass(frozen=True)
@@ -122,9 +57,6 @@ class Town:
     opposing: NDArray[np.bool_]
 
 
-# --- geometry -------------------------------------------------------------------------------------------------------
-
-
 def highway_lane(strip: Strip) -> AbstractLane:
     """highway-env's lane of a strip."""
     piece = strip.piece
@@ -143,147 +75,6 @@ def highway_lane(strip: Strip) -> AbstractLane:
     centre = [piece.x - sign * radius * math.sin(piece.heading), piece.y + sign * radius * math.cos(piece.heading)]
     start = piece.heading - sign * math.pi / 2
     return CircularLane(centre, radius, start, start + piece.curvature * piece.length, clockwise=sign > 0, **options)
-
-
-def _direction(arm: int) -> tuple[float, float, float]:
-    """Unit vector and heading from a node into an arm; exact, so that streets lie exactly along the axes."""
-    return ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[arm] + ((0.0, 0.5, 1.0, -0.5)[arm] * math.pi,)
-
-
-def _pose(arm: int, lane: int, reach: float, *, inbound: bool) -> tuple[float, float, float]:
-    """Where a lane of an arm meets a junction at the origin; lane 0 is next to the middle of the street."""
-    x, y, heading = _direction((arm + 2) % 4 if inbound else arm)
-    along = -reach if inbound else reach
-    side = (lane + 0.5) * LANE_WIDTH
-    return along * x - side * y, along * y + side * x, heading
-
-
-def _connect(start: tuple[float, float, float], end: tuple[float, float, float], turn: Turn) -> list[Piece]:
-    """Pieces between two poses: straight, an S of two arcs, or a quarter turn with a straight before or after it."""
-    x, y, heading = start
-    c, s = math.cos(heading), math.sin(heading)
-    ahead = (end[0] - x) * c + (end[1] - y) * s
-    aside = -(end[0] - x) * s + (end[1] - y) * c  # to the right
-    if turn == "straight" and abs(aside) < 1e-9:
-        return [Piece(x, y, heading, 0.0, ahead)]
-    if turn == "straight":
-        angle = 2 * math.atan2(abs(aside), ahead)
-        radius = ahead / (2 * math.sin(angle))
-        curvature = math.copysign(1 / radius, aside)
-        first = Piece(x, y, heading, curvature, radius * angle)
-        return [first, Piece(*first.end(), -curvature, radius * angle)]
-    sign = 1 if turn == "right" else -1
-    radius = min(ahead, abs(aside))
-    pieces = []
-    if ahead - radius > 1e-9:
-        pieces.append(Piece(x, y, heading, 0.0, ahead - radius))
-        x, y, heading = pieces[-1].end()
-    pieces.append(Piece(x, y, heading, sign / radius, radius * math.pi / 2))
-    if abs(aside) - radius > 1e-9:
-        pieces.append(Piece(*pieces[-1].end(), 0.0, abs(aside) - radius))
-    return pieces
-
-
-# --- junctions ------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Way:
-    arm: int
-    lane: int
-    to_arm: int
-    to_lane: int
-    turn: Turn
-    pieces: tuple[Piece, ...]
-
-
-@dataclass(frozen=True)
-class _Junction:
-    ways: tuple[_Way, ...]
-    enter: Floats
-    leave: Floats
-
-
-def _lane_turns(lanes: int, turns: list[Turn], straight_lanes: int) -> list[list[Turn]]:
-    """Which turns each lane of an approach offers, lane 0 next to the middle; two lanes never merge in a junction."""
-    if lanes == 1:
-        return [turns]
-    if len(turns) == 2:  # at a T each lane has a use of its own
-        return [turns[:1], turns[1:]]
-    return [["left", "straight"] if straight_lanes == 2 else ["left"], ["straight", "right"]]
-
-
-@cache
-def _junction(arms: tuple[int, int, int, int], reach: float) -> _Junction:
-    """All ways through a junction at the origin whose arms have so many lanes each way (0: no such arm)."""
-    ways = []
-    for arm, lanes in enumerate(arms):
-        if not lanes:
-            continue
-        exits: list[tuple[Turn, int]] = [("left", (arm + 1) % 4), ("straight", (arm + 2) % 4), ("right", (arm + 3) % 4)]
-        exits = [(turn, to) for turn, to in exits if arms[to]]
-        bend = sum(n > 0 for n in arms) == 2
-        offered = (
-            [[exits[0][0]]] * lanes if bend else _lane_turns(lanes, [turn for turn, _ in exits], arms[(arm + 2) % 4])
-        )
-        for lane in range(lanes):
-            for turn, to in exits:
-                if turn not in offered[lane]:
-                    continue
-                for to_lane in _exit_lanes(turn, lane, lanes, arms[to], ways=1 if bend else len(exits)):
-                    pieces = _connect(
-                        _pose(arm, lane, reach, inbound=True), _pose(to, to_lane, reach, inbound=False), turn
-                    )
-                    ways.append(_Way(arm, lane, to, to_lane, turn, tuple(pieces)))
-    return _Junction(tuple(ways), *_conflicts(ways))
-
-
-def _exit_lanes(turn: Turn, lane: int, lanes: int, to_lanes: int, *, ways: int) -> list[int]:
-    """Lanes that a turn of a lane leads to: any that no other vehicle of the same green may need.
-
-    More than one, because nobody changes lanes on a street.
-    """
-    if ways == 1 or (ways == 3 and turn == "straight" and lanes == to_lanes):
-        return [lane]
-    if ways == 3 and turn == "left":  # or left turns from across would meet
-        return [0]
-    return list(range(to_lanes))
-
-
-def _conflicts(ways: list[_Way]) -> tuple[Floats, Floats]:
-    """Where ways from different arms are in each other's way, as in `Town`."""
-    enter = np.full((len(ways), len(ways)), np.nan)
-    leave = enter.copy()
-    bodies = [_bodies(way.pieces) for way in ways]
-    for a, (discs_a, s_a) in enumerate(bodies):
-        for b, (discs_b, s_b) in enumerate(bodies[:a]):
-            if ways[a].arm == ways[b].arm:
-                continue
-            dx = discs_a[:, :, 0].reshape(-1, 1) - discs_b[:, :, 0].reshape(1, -1)
-            dy = discs_a[:, :, 1].reshape(-1, 1) - discs_b[:, :, 1].reshape(1, -1)
-            near = dx * dx + dy * dy < (2 * COVER + SLACK) ** 2
-            meet = near.reshape(len(s_a), len(DISCS), len(s_b), len(DISCS)).max(axis=(1, 3))
-            for one, other, s, own in ((a, b, s_a, meet.max(axis=1)), (b, a, s_b, meet.max(axis=0))):
-                if own.any():
-                    enter[one, other], leave[one, other] = s[own][0] + LENGTH / 2, s[own][-1] - LENGTH / 2
-    return enter, leave
-
-
-def _bodies(pieces: tuple[Piece, ...]) -> tuple[Floats, Floats]:
-    """Where the discs of a vehicle on its way are, [P, 3, 2] m, and how far along its centre is then, [P] m."""
-    discs, distances, done = [], [], 0.0
-    for piece in pieces:
-        s = np.linspace(0, piece.length, math.ceil(piece.length) + 1)
-        x, y, heading = piece.at(s)
-        heading = heading - math.asin(piece.curvature * LENGTH / 2)  # a vehicle's middle slips outwards
-        axis = np.stack([np.cos(heading), np.sin(heading)], axis=1)
-        discs.append(np.stack([x, y], axis=1)[:, None] + DISCS[:, None] * axis[:, None])
-        distances.append(s + done)
-        done += piece.length
-    return np.concatenate(discs), np.concatenate(distances)
-
-
-# --- the grid -------------------------------------------------------------------------------------------------------
 
 
 def _grid(rows: int, columns: int) -> list[tuple[int, int]]:
@@ -451,7 +242,7 @@ class _Draft:
         self.inbound: dict[tuple[int, int, int], int] = {}  # node, arm, lane -> strip
         self.outbound: dict[tuple[int, int, int], int] = {}
         self.movements: list[Movement] = []
-        self.blocks: list[tuple[int, _Junction]] = []  # first movement of a junction, its template
+        self.blocks: list[tuple[int, Junction]] = []  # first movement of a junction, its template
         self.signals: list[Signal] = []
         self.phases: list[int] = []
 
@@ -464,7 +255,7 @@ class _Draft:
             (x0, y0), (x1, y1) = self.centre(start), self.centre(end)
             length = abs(x1 - x0) + abs(y1 - y0) - self.reach[start] - self.reach[end]
             for lane in range(lanes):
-                x, y, heading = _pose(arm, lane, self.reach[start], inbound=False)
+                x, y, heading = pose_at(arm, lane, self.reach[start], inbound=False)
                 self.outbound[start, arm, lane] = self.inbound[end, back, lane] = len(self.strips)
                 self.strips.append(
                     Strip(
@@ -480,14 +271,14 @@ class _Draft:
     def add_junction(self, node: int) -> None:
         arms = self.arms[node]
         first, second, third, fourth = arms
-        plan = _junction((first, second, third, fourth), self.reach[node])
+        plan = draw_junction((first, second, third, fourth), self.reach[node])
         self.blocks.append((len(self.movements), plan))
         x, y = self.centre(node)
         taken: dict[tuple[str, str], int] = {}
         bend = sum(lanes > 0 for lanes in arms) == 2
         for way in plan.ways:
             entry, exit_ = self.inbound[node, way.arm, way.lane], self.outbound[node, way.to_arm, way.to_lane]
-            left, right = _borders(way, arms, bend=bend)
+            left, right = junction_borders(way, arms, bend=bend)
             names = [self.strips[entry].index[1]]
             names += [f"{node}.{len(self.movements)}.{k}" for k in range(1, len(way.pieces))]
             names.append(self.strips[exit_].index[0])
@@ -542,12 +333,3 @@ class _Draft:
             leave=leave,
             opposing=opposing,
         )
-
-
-def _borders(way: _Way, arms: list[int], *, bend: bool) -> tuple[str, str]:
-    """Borders of a way: the kerb on its right where nothing leaves there; lines only through bends."""
-    outer = way.lane == arms[way.arm] - 1 and way.to_lane == arms[way.to_arm] - 1
-    kerb = outer and (way.turn == "right" or bend or (way.turn == "straight" and not arms[(way.arm + 3) % 4]))
-    if not bend:
-        return "none", "curb" if kerb else "none"
-    return "solid" if way.lane == 0 else "dashed", "curb" if kerb else "dashed"

@@ -1,0 +1,1 @@
+"""Statistics, claims and confounds: pure functions of result tables."""

@@ -1,0 +1,70 @@
+"""Scores of predictions: confusion, floors, probes."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from scipy import optimize, special
+from sklearn import metrics
+from sklearn.decomposition import PCA
+from sklearn.dummy import DummyRegressor
+from sklearn.linear_model import Ridge
+from sklearn.model_selection import cross_val_predict
+from sklearn.preprocessing import StandardScaler
+
+from study.analysis.intervals import generator
+from study.analysis.learning_curves import Array
+from study.config.paper import ACCELERATIONS
+
+CLASSES = range(len(ACCELERATIONS))
+
+
+def steering_floor(labels: Array) -> float:
+    """Return the steering loss (smooth L1, Sec. III-B.3) of the best constant command: what a policy must beat."""
+    return float(optimize.minimize_scalar(lambda constant: special.huber(1, labels - constant).mean()).fun)
+
+
+def confusion(predicted: NDArray[np.uint8], label: NDArray[np.uint8]) -> Array:
+    """Return the share of each true class (row) that is given each class (column), for each seed: [S, 3, 3]."""
+    tables = [metrics.confusion_matrix(label, row, labels=CLASSES, normalize="true") for row in predicted]
+    return np.stack(tables)
+
+
+def macro_f1(predicted: NDArray[np.uint8], label: NDArray[np.uint8]) -> Array:
+    """Return the mean over classes of the harmonic mean of precision and recall, for each seed: [S]."""
+    return np.array(
+        [metrics.f1_score(label, row, labels=CLASSES, average="macro", zero_division=0.0) for row in predicted]
+    )
+
+
+def episode_accuracy(predicted: NDArray[np.uint8], label: NDArray[np.uint8], episode: NDArray[np.int32]) -> pd.Series:
+    """Return the accuracy in each test episode, mean over seeds: frames of one drive are no independent samples."""
+    return pd.Series((predicted == label).mean(axis=0)).groupby(episode).mean()
+
+
+def probe(z: NDArray[np.float32], target: Array, drive: NDArray[np.int32], folds: int = 5) -> float:
+    """Return the share of a target's variance that ridge regression on latents explains in drives not seen (R2).
+
+    z [N, 64]; target [N], NaN where there is none; whole drives are held out in turn. NaN where fewer than `folds`
+    drives have the target, or it does not vary.
+    """
+    known = np.isfinite(target)
+    y, group = target[known], drive[known]
+    names = np.unique(group)
+    if len(names) < folds or np.ptp(y) == 0:
+        return math.nan
+    x = StandardScaler().fit_transform(z[known].astype(np.float64))
+    tests = [np.isin(group, held) for held in np.array_split(generator("probe").permutation(names), folds)]
+    splits = [(np.flatnonzero(~test), np.flatnonzero(test)) for test in tests]
+    guess, mean = (cross_val_predict(model, x, y, cv=splits) for model in (Ridge(), DummyRegressor()))
+    return float(1 - ((y - guess) ** 2).sum() / ((y - mean) ** 2).sum())
+
+
+def principal(z: NDArray[np.float32]) -> tuple[Array, Array]:
+    """Return the first two principal components of z-scored latents [N, 2], and their shares of the variance [2]."""
+    components = PCA(2, svd_solver="full")
+    places = components.fit_transform(StandardScaler().fit_transform(z.astype(np.float64)))
+    return np.asarray(places), np.asarray(components.explained_variance_ratio_)

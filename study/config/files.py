@@ -1,0 +1,96 @@
+"""Read profiles and sweep files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import ValidationError
+
+from study.config.grid import Grid
+from study.config.settings import Model, StudySettings
+from study.config.workspace import SWEEPS
+from study.errors import BadInputError, one_of
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """A YAML file's mapping. Raises BadInputError when it is missing, broken or no mapping."""
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise BadInputError(f"cannot read {path}: {error.strerror}") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        where = getattr(error, "problem_mark", None)
+        line = f", line {where.line + 1}" if where else ""
+        raise BadInputError(f"{path}{line} is not valid YAML: {getattr(error, 'problem', error)}") from error
+    if not isinstance(content, dict):
+        raise BadInputError(f"{path} holds no settings (a mapping such as 'encoder: {{epochs: 15}}' is needed)")
+    return content
+
+
+def named_files(folder: Path) -> dict[str, Path]:
+    """Name -> path of the YAML files in a folder, by name."""
+    return {path.stem: path for path in sorted(folder.glob("*.yaml"), key=lambda path: path.stem)}
+
+
+def explain(error: ValidationError, source: str) -> BadInputError:
+    """The clear form of pydantic's complaint."""
+    lines: list[str] = []
+    for item in error.errors(include_url=False):
+        if item["type"] == "too_short" and lines:  # follows from the error inside, which is told already
+            continue
+        where = ".".join(str(part) for part in item["loc"])
+        if item["type"] == "extra_forbidden":
+            lines.append(f"unknown setting '{where}'")
+            continue
+        message = item["msg"].removeprefix("Value error, ")
+        got = "" if isinstance(item["input"], dict) else f" (got {item['input']!r})"
+        lines.append(f"{where}: {message}{got}" if where else message)
+    return BadInputError(f"{source}: " + "; ".join(lines))
+
+
+def validated(model: type[Model], content: object, source: str) -> Model:
+    """The content as that model. Raises BadInputError that names the source and every field that is wrong."""
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        raise explain(error, source) from error
+
+
+def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    """`base` with the values of `over`, nested mappings merged."""
+    merged = dict(base)
+    for name, value in over.items():
+        below = merged.get(name)
+        merged[name] = merge(below, value) if isinstance(value, dict) and isinstance(below, dict) else value
+    return merged
+
+
+def load_grid(
+    name: str, overrides: dict[str, Any] | None = None, folder: Path = SWEEPS, profile: str = "laptop"
+) -> Grid:
+    """The sweep of that name, with that profile's rules. Raises BadInputError for an unknown sweep or setting."""
+    files = named_files(folder)
+    if name not in files:
+        raise one_of("sweep", name, files or [f"nothing: there are no sweep files in {folder.absolute()}"])
+    content = merge(read_yaml(files[name]), overrides or {}) | {"name": name}
+    if isinstance(content.get("rules"), dict):
+        content["rules"] = {rule: _of_profile(value, profile) for rule, value in content["rules"].items()}
+    return validated(Grid, content, f"sweep {name}")
+
+
+def _of_profile(value: object, profile: str) -> object:
+    """A rule's number for a profile; what cannot be chosen from stays, for the check to name it."""
+    if not isinstance(value, dict):
+        return value
+    numbers = [each for each in value.values() if isinstance(each, int | float)]
+    return value.get(profile, max(numbers)) if len(numbers) == len(value) > 0 else value
+
+
+def load_profile(name: str, overrides: dict[str, Any] | None = None, folder: Path = SWEEPS) -> StudySettings:
+    """The profile of that name. Raises BadInputError for an unknown profile or setting."""
+    files = named_files(folder / "profiles")
+    if name not in files:
+        raise one_of("profile", name, files)
+    return validated(StudySettings, merge(read_yaml(files[name]), overrides or {}), f"profile {name}")

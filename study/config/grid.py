@@ -1,0 +1,100 @@
+"""The grid of a sweep file: which cells a study has, and the rules of its claims."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Self
+
+from pydantic import Field, model_validator
+
+from study.config.heads import CEILING, HEAD_SETS
+from study.config.settings import Count, NotNegative, Settings, Share
+
+Fraction = Annotated[float, Field(gt=0, le=1)]
+
+
+class Rules(Settings):
+    """When a claim counts as reproduced, decided before the run (PAPER.md section 3; used by `study.analysis.claims`).
+
+    A sweep file gives each rule a number, or one for each profile: `{smoke: 0.1, laptop: 0.015}`; a profile that is not
+    named takes the largest.
+
+    Three of them stand for what a study of one encoder a cell cannot see; a run of several (`heads-encoders`) checks
+    them. With s the sd over encoders of one head set (the report's variance components, pooled over head sets), two
+    encoders differ by sqrt(2) s, and the largest of a claim's three contrasts by up to 3.4 s at 0.05 (of one: 2.8 s).
+    So `encoder_allowance` should be at least 3.4 s of final accuracy, 3.4 s of final steering loss should be well below
+    `steering_margin`, and `spread_factor` at least exp(3.4 s) with s that of the log of the variance over P policies,
+    whose square is smaller than what is found by 2 / (P - 1), the part of chance: this needs P = 10 or more.
+    What was found is in benchmarks/README.md.
+    """
+
+    alpha: Annotated[float, Field(gt=0, lt=0.5)] = Field(0.05, description="error rate of a claim's contrasts together")
+    accuracy_margin: NotNegative = Field(0.005, description="smallest difference in accuracy that matters")
+    encoder_allowance: NotNegative = Field(
+        0.015,
+        description="what two encoders may differ in accuracy by their seeds alone; added to both ends of an interval "
+        "when there is one encoder for each cell",
+    )
+    steering_margin: NotNegative = Field(
+        0.05, description="largest difference in steering loss that is none, as a share of the best constant's loss"
+    )
+    reach_slack: Share = Field(0.1, description="how much later than the text says, as a share of all epochs")
+    spread_factor: Annotated[float, Field(ge=1)] = Field(
+        1.5,
+        description="what two encoders may differ in the variance of their policies, with one encoder for each cell",
+    )
+
+
+class Grid(Settings):
+    """A sweep file: the cells of a study and what is read off them."""
+
+    name: str
+    title: str = Field(description="headline of the report")
+    heads: Annotated[tuple[str, ...], Field(min_length=1)] = Field(description="head sets")
+    fractions: Annotated[tuple[Fraction, ...], Field(min_length=1)] = Field(
+        (1.0,), description="data fractions in (0, 1] (Sec. V-B)"
+    )
+    encoder_seeds: Count = Field(1, description="encoders for each head set and fraction")
+    policy_seeds: Count = Field(15, description="policies on each encoder (Sec. V-A: 15)")
+    baseline: str = Field("rec", description="head set that the others are compared with")
+    ceiling: bool = Field(default=True, description="one more cell: policies on the true state, as a ceiling")
+    claims: tuple[str, ...] = Field((), description="claims of the paper that this sweep tests")
+    rules: Rules = Field(Rules(), description="when a claim counts as reproduced")
+    settings: dict[str, Any] = Field(default_factory=dict, description="settings that differ from every profile's")
+
+    @model_validator(mode="after")
+    def _known(self) -> Self:
+        for heads in (*self.heads, self.baseline):
+            if heads not in HEAD_SETS:
+                raise ValueError(f"unknown head set '{heads}'; choose from {', '.join(HEAD_SETS)}")
+        for name in ("heads", "fractions"):
+            values = getattr(self, name)
+            if len(set(values)) != len(values):
+                raise ValueError(f"{name}: {list(values)} names one twice")
+        return self
+
+    def cells(self) -> list[Cell]:
+        """The cells in the order they are worth running: one encoder seed of everything first, the ceiling last."""
+        return [
+            *(
+                Cell(heads=heads, fraction=fraction, encoder_seed=seed)
+                for seed in range(self.encoder_seeds)
+                for fraction in self.fractions
+                for heads in self.heads
+            ),
+            *[Cell(heads=CEILING)] * self.ceiling,
+        ]
+
+
+class Cell(Settings):
+    """One point of the grid: an encoder, and the policies on it."""
+
+    heads: str
+    fraction: Fraction = 1.0
+    encoder_seed: Annotated[int, Field(ge=0)] = 0
+
+    @property
+    def label(self) -> str:
+        """Name for people, e.g. `rec+plan 100% e0`."""
+        if self.heads == CEILING:
+            return f"{CEILING} (ceiling)"
+        return f"{self.heads} {self.fraction * 100:g}% e{self.encoder_seed}"

@@ -1,0 +1,78 @@
+"""Content keys: what a product depends on names the product."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from typing import Any
+
+from pydantic import BaseModel
+
+from study.config.grid import Cell
+from study.config.heads import CEILING, HEAD_SETS
+from study.config.settings import StudySettings
+
+
+def content_key(stage: str, settings: object, inputs: tuple[str, ...], format_version: int) -> str:
+    """Key of a stage's product: 16 hex digits of sha256 over the canonical JSON of all that it is made from."""
+    plain = settings.model_dump(mode="json") if isinstance(settings, BaseModel) else settings
+    text = json.dumps(
+        {"stage": stage, "settings": plain, "inputs": inputs, "format_version": format_version},
+        sort_keys=True,
+        separators=(",", ":"),
+        allow_nan=False,
+    )
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+# Raised on purpose when a stage's code changes what it makes; a test holds each product's digest.
+FORMAT_VERSIONS = {"episodes": 1, "frames": 1, "encoder": 1, "state": 1, "cell": 1}
+
+
+def recording_key(settings: StudySettings) -> str:
+    """Key of the drives: each is then known by its seed. How many there are does not matter here."""
+    own = {
+        "town": settings.town.model_dump(mode="json"),
+        "warm_up": settings.recording.warm_up,
+        "duration": settings.recording.duration,
+    }
+    return content_key("episodes", own, (), FORMAT_VERSIONS["episodes"])
+
+
+def drive_name(seed: int) -> str:
+    """Name of the drive of that seed, in the folder of its recording key."""
+    return f"{seed:08d}"
+
+
+def frames_key(settings: StudySettings, source: str | None = None) -> str:
+    """Key of the frame store; `source` stands for the drives when they are not our town's."""
+    own = {
+        "frames": settings.frames.model_dump(mode="json", exclude={"unit"}),  # says how a store is used
+        "birdview": settings.birdview.model_dump(mode="json"),
+    }
+    if source is None:
+        own["drives"] = settings.recording.model_dump(
+            mode="json", include={"encoder_episodes", "policy_episodes", "seed"}
+        )
+    return content_key("frames", own, (source or recording_key(settings),), FORMAT_VERSIONS["frames"])
+
+
+def encoder_key(settings: StudySettings, cell: Cell, frames: str) -> str:
+    """Key of a trained encoder. What makes no difference at the full data is left out there."""
+    if cell.heads == CEILING:
+        return content_key("state", {}, (frames,), FORMAT_VERSIONS["state"])
+    own: dict[str, Any] = {
+        "encoder": settings.encoder.model_dump(mode="json", exclude={"budget", "head_weights"}),
+        "heads": {head: settings.encoder.head_weights.get(head, 1.0) for head in HEAD_SETS[cell.heads]},
+        "fraction": cell.fraction,
+        "encoder_seed": cell.encoder_seed,
+    }
+    if cell.fraction < 1:
+        own |= {"budget": settings.encoder.budget, "unit": settings.frames.unit}
+    return content_key("encoder", own, (frames,), FORMAT_VERSIONS["encoder"])
+
+
+def cell_key(settings: StudySettings, cell: Cell, policy_seeds: int, frames: str) -> str:
+    """Key of a cell's result: its encoder and the policies on it."""
+    own = {"policy": settings.policy.model_dump(mode="json"), "policy_seeds": policy_seeds}
+    return content_key("cell", own, (encoder_key(settings, cell, frames),), FORMAT_VERSIONS["cell"])

@@ -1,0 +1,1 @@
+"""The terminal: options, the live display, and Ctrl-C."""

@@ -1,0 +1,1 @@
+"""From Episodes to frames: bird views, head targets, selection, store and data card."""

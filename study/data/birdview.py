@@ -1,0 +1,389 @@
+"""Bird view: an Episode's moments as images and masks (Sec. III-A). Reads Episodes only, never the simulator.
+
+Layers, in paint order: map (drivable surface, road boundary, lane lines), the planned way ahead (green, or red by the
+light that governs it), other vehicles' past and present poses (yellow), the ego's (blue). Everything is painted with
+hard edges at `settings.render` pixels a side, as indices into a palette, and area-averaged to 64.
+
+The map does not change during a drive, so it is painted once for the whole Episode; a frame cuts its window out of
+that picture and paints the moving things into it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from study.config.paper import IMAGE
+from study.config.settings import BirdviewSettings
+from study.episode.schema import GREEN, RATE_HZ, Episode, Lane
+from study.errors import BadInputError
+
+FORMAT_VERSION = 1  # raise it when the same Episode and settings give other pixels
+MASK_BYTES = IMAGE * IMAGE // 8
+
+SURFACE = (16, 8)  # grey of a lane: the first, and how much lighter for each LIMIT_STEP of its speed limit
+PLAIN_SURFACE = 80  # grey where all lanes have one limit, and that of 40 km/h
+LIMIT_STEP, LIMIT_SHADES = 5 / 3.6, 20  # [m/s]; limits of 95 km/h and more look alike
+BOUNDARY, LINE = 176, 255  # greys of curbs and of lane lines
+BOUNDARY_WIDTH, LINE_WIDTH, ROUTE_WIDTH = 0.5, 0.3, 2.0  # [m]
+DASH = 3.0  # [m], length of a dash and of the gap behind it
+ROUTE_POINTS = 2.0  # [m] apart: 0.1 m off on the tightest turn of a car
+
+MAP_BYTES = 1 << 26  # a larger map (1.3 km a side at 6.4 pixels per metre) is painted anew for every frame
+MAP_SIDE = 32_000  # cv2 addresses the pixels of a picture it cuts from with 16 bits
+CHUNK = 64  # moments whose geometry is computed together
+
+_PLAIN, _BOUNDARY, _LINE = 1 + LIMIT_SHADES, 2 + LIMIT_SHADES, 3 + LIMIT_SHADES  # palette; 0 is beside the road
+_GREEN, _RED, _OTHERS = 4 + LIMIT_SHADES, 5 + LIMIT_SHADES, 6 + LIMIT_SHADES  # others' oldest pose, then younger ones
+_MASK = 240  # of a set pixel: averages of sixteen such are whole numbers
+_SHIFT = 8  # fractional bits of the coordinates given to cv2
+
+Image = NDArray[np.uint8]
+Moments = NDArray[np.int64]
+Floats = NDArray[np.float64]
+_Shape = tuple[Floats, int, float]  # points [P, 2] m, palette index, width of a line [m]; no width: a filled polygon
+
+
+def render_birdview(
+    episode: Episode, step: int, agent_index: int, settings: BirdviewSettings
+) -> tuple[Image, NDArray[np.bool_], NDArray[np.bool_]]:
+    """One moment as (image [64, 64, 3] uint8 RGB, pred [64, 64] bool, plan [64, 64] bool), see `Renderer.render`."""
+    images, masks = Renderer(episode, settings).render(np.array([[step, agent_index]]))
+    pred, plan = np.unpackbits(masks[0], axis=1).reshape(2, IMAGE, IMAGE).astype(bool)
+    return images[0], pred, plan
+
+
+def check_rate(episode: Episode) -> None:
+    """Raise BadInputError for an Episode that is not at 10 Hz, the rate of history and future (Sec. III-A)."""
+    if abs(episode.rate_hz - RATE_HZ) > 0.01:
+        raise BadInputError(
+            f"Episode {episode.id} has {episode.rate_hz:g} steps per second; bird views need {RATE_HZ:g}: "
+            "resample it with 'python -m study.data import'"
+        )
+
+
+def valid_moments(episode: Episode, settings: BirdviewSettings) -> Moments:
+    """Moments (step, agent index) [M, 2] int64 that may become frames, sorted.
+
+    The agent may be ego, is there during all of its history and future, and its steering and acceleration are known.
+    """
+    check_rate(episode)
+    before, after = settings.history, settings.future
+    there = np.pad(episode.present.cumsum(axis=0, dtype=np.int64), ((1, 0), (0, 0)))
+    span = before + after + 1
+    good = np.zeros_like(episode.present)
+    if episode.steps >= span:
+        good[before : episode.steps - after] = there[span:] - there[:-span] == span
+    good &= np.array([agent.ego for agent in episode.agents], bool)
+    good &= np.isfinite(episode.steering) & np.isfinite(episode.acceleration)
+    return np.argwhere(good).astype(np.int64, copy=False)
+
+
+def governing_light(episode: Episode, settings: BirdviewSettings, moments: Moments) -> NDArray[np.uint8]:
+    """State [M] uint8 of the light that governs each moment's ego: GREEN where there is none within `light_range`."""
+    steps, agents = moments[:, 0], moments[:, 1]
+    light = episode.light[steps, agents]
+    near = (light >= 0) & (episode.light_distance[steps, agents] <= settings.light_range)  # an unknown distance is not
+    state = np.full(len(moments), GREEN, np.uint8)
+    state[near] = episode.light_state[steps[near], light[near]]
+    return state
+
+
+@dataclass(frozen=True)
+class _Window:
+    """Where the field of view lies around the ego: pixels per metre, ego's column and row in pixels."""
+
+    scale: float
+    column: float
+    row: float
+
+    def affines(self, x: Floats, y: Floats, heading: Floats) -> Floats:
+        """World [m] -> pixel centres [M, 2, 3] for egos [M], heading up; left of the ego is left in the picture."""
+        east, north = self.scale * np.cos(heading), self.scale * np.sin(heading)
+        column = np.stack([north, -east, self.column - 0.5 - north * x + east * y], axis=1)
+        row = np.stack([-east, -north, self.row - 0.5 + east * x + north * y], axis=1)
+        return np.stack([column, row], axis=1)
+
+
+class Renderer:
+    """Paints moments of one Episode; holds the Episode's painted map.
+
+    Raises BadInputError when the Episode is not at 10 Hz.
+    """
+
+    def __init__(self, episode: Episode, settings: BirdviewSettings) -> None:
+        check_rate(episode)
+        self.episode = episode
+        self.settings = settings
+        self._palette = _palette(settings.history)
+        scale = settings.render / settings.view
+        self._window = _Window(scale, settings.render / 2, (settings.view - settings.behind) * scale)
+        self._sizes = np.array([(agent.length, agent.width) for agent in episode.agents]).reshape(-1, 2)
+        self._map = _Map(episode.lanes, scale, settings.render)
+        self._routes = [
+            (np.concatenate([[0.0], np.hypot(*np.diff(route, axis=0).T).cumsum()]), *route.T.astype(np.float64))
+            if len(route) > 1
+            else None
+            for route in episode.routes
+        ]
+        corner = np.hypot(settings.view / 2, max(settings.behind, settings.view - settings.behind))
+        self._route_ahead = np.arange(0, 1.5 * corner, ROUTE_POINTS)
+
+    def render(self, moments: NDArray[np.integer[Any]]) -> tuple[Image, Image]:
+        """Paint moments [M, 2] of (step, agent index): images [M, 64, 64, 3] uint8 RGB, masks [M, 2, 512] uint8.
+
+        The masks are pred (the other vehicles) and plan (the ego): the union of oriented boxes at the next
+        `settings.future` poses in the present ego frame, set where at least half of a pixel is covered, 4096 bits in
+        row-major order packed by `np.packbits`. Poses outside the recorded steps are not painted.
+        Raises BadInputError when a moment's agent is not there.
+        """
+        moments = np.asarray(moments, np.int64).reshape(-1, 2)
+        self._check(moments)
+        images = np.empty((len(moments), IMAGE, IMAGE, 3), np.uint8)
+        masks = np.empty((len(moments), 2, MASK_BYTES), np.uint8)
+        threads = cv2.getNumThreads()
+        cv2.setNumThreads(1)  # frames are too small to share; processes are what we spread them over
+        try:
+            for start in range(0, len(moments), CHUNK):
+                part = slice(start, start + CHUNK)
+                self._render(moments[part], images[part], masks[part])
+        finally:
+            cv2.setNumThreads(threads)
+        return images, masks
+
+    def _check(self, moments: Moments) -> None:
+        steps, agents = self.episode.present.shape
+        for step, agent in moments.tolist():
+            if not (0 <= step < steps and 0 <= agent < agents and self.episode.present[step, agent]):
+                raise BadInputError(
+                    f"Episode {self.episode.id}: no agent with index {agent} at step {step}; "
+                    f"it has {agents} agents and {steps} steps"
+                )
+
+    def _render(self, moments: Moments, images: Image, masks: Image) -> None:
+        episode, size = self.episode, self.settings.render
+        now = (moments[:, 0], moments[:, 1])
+        x, y, heading = (values[now].astype(np.float64) for values in (episode.x, episode.y, episode.heading))
+        affines = self._window.affines(x, y, heading)
+        cuts = self._map.cuts(affines)
+        boxes, colours, ends = self._boxes(moments, affines, heading)
+        states = governing_light(episode, self.settings, moments).tolist()
+        canvas, flat = np.empty((size, size), np.uint8), np.empty((size, size), np.uint8)
+        grey = np.zeros((len(moments), 2, IMAGE, IMAGE), np.uint8)
+        start = 0
+        for index, (seen, pred, plan) in enumerate(ends):
+            self._map.paint(canvas, affines[index], cuts[index])
+            self._paint_route(canvas, affines[index], moments[index], states[index])
+            for box, colour in zip(boxes[start:seen], colours[start:seen], strict=True):
+                cv2.fillConvexPoly(canvas, box, colour, cv2.LINE_8, _SHIFT)
+            channels = [_shrink(cv2.LUT(canvas, channel, dst=flat)) for channel in self._palette]
+            cv2.merge(channels, dst=images[index])
+            for mask, covering in enumerate((boxes[seen:pred], boxes[pred:plan])):
+                if covering:
+                    flat.fill(0)
+                    for box in covering:
+                        cv2.fillConvexPoly(flat, box, _MASK, cv2.LINE_8, _SHIFT)
+                    grey[index, mask] = _shrink(flat)
+            start = plan
+        masks[:] = np.packbits((grey >= _MASK // 2).reshape(len(moments), 2, -1), axis=2)
+
+    def _boxes(
+        self, moments: Moments, affines: Floats, heading: Floats
+    ) -> tuple[list[NDArray[np.int32]], list[int], list[list[int]]]:
+        """Boxes in paint order, frame by frame, with palette indices; for each frame the ends of its three parts.
+
+        The parts are past and present poses, the others' next poses, the ego's next poses.
+        """
+        episode, history, size = self.episode, self.settings.history, self.settings.render
+        scale = self._window.scale
+        offsets = np.arange(-history, self.settings.future + 1)
+        steps = moments[:, :1] + offsets
+        inside = (steps >= 0) & (steps < episode.steps)
+        steps = steps.clip(0, episode.steps - 1)
+        # Cull around the centre of the view in float32: cheap, and a metre of margin covers its rounding.
+        centre = np.array([size / 2, size / 2]) - affines[:, :, 2]
+        middle = (np.einsum("mij,mi->mj", affines[:, :, :2], centre) / scale**2).astype(np.float32)
+        east = episode.x[steps] - middle[:, 0, None, None]
+        north = episode.y[steps] - middle[:, 1, None, None]
+        reach = np.hypot(*self._sizes.T).max(initial=0) / 2 + 1
+        near = east * east + north * north < np.float32(self.settings.view / 2**0.5 + reach) ** 2  # NaN is never near
+        near &= episode.present[steps] & inside[..., None]
+        frame, pose, agent = np.nonzero(near)
+        step = steps[frame, pose]
+
+        at = np.stack([episode.x[step, agent], episode.y[step, agent], np.ones(len(step))], axis=1)
+        column, row = np.einsum("kij,kj->ik", affines[frame], at)
+        margin = reach * scale
+        seen = (column > -margin) & (column < size + margin) & (row > -margin) & (row < size + margin)
+        frame, pose, agent, step, column, row = (v[seen] for v in (frame, pose, agent, step, column, row))
+
+        turn = episode.heading[step, agent] - heading[frame]
+        # cv2 fills a pixel whose centre lies up to half a pixel outside: boxes are made that much smaller.
+        half = self._sizes[agent] * (scale / 2) - 0.5
+        along = np.stack([-np.sin(turn), -np.cos(turn)], axis=1) * half[:, :1]
+        across = np.stack([-np.cos(turn), np.sin(turn)], axis=1) * half[:, 1:]
+        front, back = along + across, along - across
+        middles = np.stack([column, row], axis=1)[:, None]
+        corners = middles + np.stack([front, back, -front, -back], axis=1)
+        fixed = np.rint(corners * (1 << _SHIFT)).astype(np.int32)
+
+        # A pose that stands where the next younger one stands is painted over by it: leave it out.
+        number = np.full((len(moments), len(offsets) + 1, near.shape[2]), -1)
+        number[frame, pose, agent] = np.arange(len(frame))
+        younger = number[frame, pose + 1, agent]
+        hidden = (younger >= 0) & (pose != history) & (fixed == fixed[younger]).all(axis=(1, 2))
+        own = agent == moments[frame, 1]
+        layer = np.where(pose <= history, 0, 2) + own  # others' past, ego's past, pred, plan
+        order = np.lexsort((pose, layer, frame))
+        order = order[~hidden[order]]
+        colour = _OTHERS + pose + own * (history + 1)
+        part = (frame * 3 + np.maximum(layer - 1, 0))[order]
+        ends = np.searchsorted(part, np.arange(len(moments) * 3), side="right").reshape(-1, 3)
+        return list(fixed[order]), colour[order].tolist(), ends.tolist()
+
+    def _paint_route(self, canvas: Image, affine: Floats, moment: Moments, light: int) -> None:
+        route, progress = self._routes[moment[1]], self.episode.route_s[moment[0], moment[1]]
+        if route is None or not np.isfinite(progress):
+            return
+        length, x, y = route
+        along = progress + self._route_ahead
+        along = along[: np.searchsorted(along, length[-1]) + 1]
+        way = np.stack([np.interp(along, length, x), np.interp(along, length, y)], axis=1)
+        width = max(1, round(ROUTE_WIDTH * self._window.scale))
+        colour = _GREEN if light == GREEN else _RED  # yellow counts as red
+        cv2.polylines(canvas, [_fixed(way, affine)], False, colour, width, cv2.LINE_8, _SHIFT)  # noqa: FBT003
+
+
+def _palette(history: int) -> Image:
+    """Colours [3, 256] RGB by palette index. Past poses fade to black, linear in their age."""
+    if _OTHERS + 2 * (history + 1) > 256:
+        raise BadInputError(f"birdview.history: at most {(256 - _OTHERS) // 2 - 1} past poses, got {history}")
+    colours = np.zeros((256, 3), np.uint8)
+    first, step = SURFACE
+    colours[1 : 1 + LIMIT_SHADES] = (first + step * np.arange(LIMIT_SHADES))[:, None]
+    colours[[_PLAIN, _BOUNDARY, _LINE]] = np.array([[PLAIN_SURFACE], [BOUNDARY], [LINE]])
+    colours[_GREEN], colours[_RED] = (0, 255, 0), (255, 0, 0)
+    light = np.rint(255 * np.arange(1, history + 2) / (history + 1))
+    colours[_OTHERS : _OTHERS + history + 1, :2] = light[:, None]
+    colours[_OTHERS + history + 1 : _OTHERS + 2 * (history + 1), 2] = light
+    return np.ascontiguousarray(colours.T)
+
+
+def _shrink(picture: Image) -> Image:
+    """The area average [64, 64] of a square picture. Halving twice is four times faster than one step by four."""
+    while picture.shape[0] % (2 * IMAGE) == 0:
+        side = picture.shape[0] // 2
+        picture = cv2.resize(picture, (side, side), interpolation=cv2.INTER_AREA)
+    if picture.shape[0] != IMAGE:
+        picture = cv2.resize(picture, (IMAGE, IMAGE), interpolation=cv2.INTER_AREA)
+    return picture
+
+
+def _fixed(points: Floats, affine: Floats) -> NDArray[np.int32]:
+    """World points [..., 2] as cv2's fixed-point pixel coordinates."""
+    fixed: NDArray[np.int32] = np.rint((points @ affine[:, :2].T + affine[:, 2]) * (1 << _SHIFT)).astype(np.int32)
+    return fixed
+
+
+class _Map:
+    """The painted map of an Episode: one large picture where it fits into memory, else painted window by window."""
+
+    def __init__(self, lanes: Sequence[Lane], scale: float, window: int) -> None:
+        self._scale, self._reach = scale, window / scale / 2**0.5 + BOUNDARY_WIDTH
+        self._shapes = _shapes(lanes)
+        self._picture: Image | None = None
+        self._origin = np.zeros(2)
+        if not self._shapes:
+            return
+        points = np.concatenate([shape for shape, _, _ in self._shapes])
+        starts = np.cumsum([0] + [len(shape) for shape, _, _ in self._shapes[:-1]])
+        self._low, self._high = np.minimum.reduceat(points, starts), np.maximum.reduceat(points, starts)
+        self._origin = self._low.min(axis=0) - 1
+        columns, rows = np.ceil((self._high.max(axis=0) + 1 - self._origin) * scale).astype(int).tolist()
+        if max(columns, rows) <= MAP_SIDE and columns * rows <= MAP_BYTES:
+            self._picture = np.zeros((rows, columns), np.uint8)
+            affine = np.column_stack([np.eye(2) * scale, -self._origin * scale - 0.5])
+            _paint(self._picture, self._shapes, affine, scale)
+
+    def cuts(self, affines: Floats) -> Floats:
+        """Pixels of the window -> pixels of the large picture [M, 2, 3], for world [m] -> pixels of the window."""
+        back = affines[:, :, :2].transpose(0, 2, 1) / self._scale  # a turn times scale: its inverse, times scale
+        shift = -back @ affines[:, :, 2:] - (self._origin * self._scale + 0.5)[:, None]
+        return np.concatenate([back, shift], axis=2)
+
+    def paint(self, canvas: Image, affine: Floats, cut: Floats) -> None:
+        """Overwrite the canvas with the map as it lies under `affine`, world [m] -> pixels; `cut` is its `cuts`."""
+        if self._picture is not None:
+            flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
+            cv2.warpAffine(self._picture, cut, canvas.shape, dst=canvas, flags=flags)
+            return
+        canvas.fill(0)
+        if self._shapes:
+            centre = np.linalg.solve(affine[:, :2], np.array(canvas.shape) / 2 - affine[:, 2])
+            near = ((self._low < centre + self._reach) & (self._high > centre - self._reach)).all(axis=1)
+            _paint(canvas, [self._shapes[number] for number in np.flatnonzero(near)], affine, self._scale)
+
+
+def _shapes(lanes: Sequence[Lane]) -> list[_Shape]:
+    """What is painted of the lanes, in paint order: surfaces, boundaries, lane lines."""
+    if not lanes:
+        return []
+    centre = np.concatenate([lane.centre for lane in lanes])
+    lane_of = np.repeat(np.arange(len(lanes)), [len(lane.centre) for lane in lanes])
+    new = np.diff(lane_of, prepend=-1) > 0
+    fresh = new | (np.diff(centre, axis=0, prepend=np.nan) != 0).any(axis=1)  # a point twice has no direction
+    centre, lane_of = centre[fresh], lane_of[fresh]
+    starts = np.searchsorted(lane_of, np.arange(len(lanes) + 1))
+    here = np.arange(len(centre))
+    after, before = np.minimum(here + 1, starts[lane_of + 1] - 1), np.maximum(here - 1, starts[lane_of])
+    tangent = centre[after] - centre[before]
+    tangent /= np.hypot(*tangent.T)[:, None].clip(1e-9)
+    half = np.array([lane.width / 2 for lane in lanes])[lane_of, None]
+    left = centre + half * np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+    right = 2 * centre - left
+
+    plain = len({lane.speed_limit for lane in lanes}) < 2
+    shades = [_PLAIN if plain or lane.speed_limit is None else _shade(lane.speed_limit) for lane in lanes]
+    joined = np.flatnonzero(after > here)
+    quads = np.stack([left[joined], left[joined + 1], right[joined + 1], right[joined]], axis=1)
+    surfaces = [(quad, shades[lane], 0) for quad, lane in zip(quads, lane_of[joined].tolist(), strict=True)]
+    boundaries: list[_Shape] = []
+    lines: list[_Shape] = []
+    for number, lane in enumerate(lanes):
+        for edge, border in ((left, lane.left), (right, lane.right)):
+            side = edge[starts[number] : starts[number + 1]]
+            if border == "curb":
+                boundaries.append((side, _BOUNDARY, BOUNDARY_WIDTH))
+            elif border == "solid":
+                lines.append((side, _LINE, LINE_WIDTH))
+            elif border == "dashed":
+                lines.extend((dash, _LINE, LINE_WIDTH) for dash in _dashes(side))
+    return surfaces + boundaries + lines
+
+
+def _shade(limit: float) -> int:
+    return 1 + min(round(limit / LIMIT_STEP), LIMIT_SHADES - 1)
+
+
+def _dashes(line: Floats) -> list[Floats]:
+    length = np.concatenate([[0.0], np.hypot(*np.diff(line, axis=0).T).cumsum()])
+    starts = np.arange(0, length[-1], 2 * DASH)
+    along = (starts[:, None] + np.linspace(0, DASH, 4)).clip(max=length[-1])
+    return list(np.stack([np.interp(along, length, line[:, 0]), np.interp(along, length, line[:, 1])], axis=2))
+
+
+def _paint(canvas: Image, shapes: Sequence[_Shape], affine: Floats, scale: float) -> None:
+    points = _fixed(np.concatenate([shape for shape, _, _ in shapes] or [np.empty((0, 2))]), affine)
+    end = 0
+    for shape, colour, metres in shapes:
+        start, end = end, end + len(shape)
+        if metres:
+            width = max(1, round(metres * scale))
+            cv2.polylines(canvas, [points[start:end]], False, colour, width, cv2.LINE_8, _SHIFT)  # noqa: FBT003
+        else:
+            cv2.fillConvexPoly(canvas, points[start:end], colour, cv2.LINE_8, _SHIFT)

@@ -1,0 +1,282 @@
+"""Build a frame store from Episodes, in parts that can be resumed."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import json
+import os
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from filelock import FileLock
+from numpy.typing import NDArray
+
+from study.config.keys import FORMAT_VERSIONS, content_key
+from study.config.settings import BirdviewSettings, FramesSettings
+from study.data.birdview import Renderer
+from study.data.frames import PARTS, SCHEMA_VERSION, SHAPES, DamagedFramesError, open_frames
+from study.data.selection import LABELS, SETS, Columns, candidates, choose, histograms
+from study.episode.files import episode_digest, file_digest, read_episode
+from study.errors import BadInputError
+from study.stages import RENDER, SELECT, Batch, Flow, Task, size
+
+CHUNK = 512  # frames painted before they are written: 7 MB
+
+
+def frames_flow(
+    frames: FramesSettings,
+    birdview: BirdviewSettings,
+    encoder_episodes: Sequence[Path],
+    policy_episodes: Sequence[Path],
+    folder: Path,
+    *,
+    key: str | None = None,
+) -> Flow[None]:
+    """Build the frame store `folder` from recorded drives; nothing happens when it is there already, and whole.
+
+    `key` names the store; by default it follows from the settings and the drives' digests. A build that was killed
+    resumes. Raises BadInputError when the drives give too few frames, serve both sets, are no Episodes, when the disk
+    is too small, or when `folder` holds something else.
+    """
+    sources = {"encoder": _sources(encoder_episodes), "policy": _sources(policy_episodes)}
+    _check_sources(sources)
+    build = _Build(frames, birdview, {"encoder": encoder_episodes, "policy": policy_episodes}, sources, folder, key)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(folder.parent / ".lock"):
+        if not build.finished():
+            yield from build.flow()
+
+
+def _sources(paths: Sequence[Path]) -> list[dict[str, str]]:
+    return [{"name": path.name, "digest": episode_digest(path)} for path in paths]
+
+
+def _check_sources(sources: dict[str, list[dict[str, str]]]) -> None:
+    seen: dict[str, str] = {}
+    for name, items in sources.items():
+        if len(items) < 2:
+            raise BadInputError(f"the {name} set has {len(items)} drives; it needs one to train and one to test")
+        for item in items:
+            other = seen.setdefault(item["digest"], name)
+            if other != name or items.count(item) > 1:
+                raise BadInputError(
+                    f"drive {item['name']} serves the {other} set and again the {name} set; every drive serves once, "
+                    "and the policy set needs drives of its own (Sec. V-A)"
+                )
+
+
+@dataclass(frozen=True)
+class _Build:
+    """One build: what goes in, where it goes."""
+
+    frames: FramesSettings
+    birdview: BirdviewSettings
+    paths: dict[str, Sequence[Path]]
+    sources: dict[str, list[dict[str, str]]]
+    folder: Path
+    given_key: str | None
+
+    @property
+    def inputs(self) -> str:
+        """Digest of all that decides the store's bytes."""
+        own = {"frames": self.frames.model_dump(mode="json", exclude={"unit"}), "sources": self.sources}
+        own |= {"birdview": self.birdview.model_dump(mode="json")}
+        return content_key("frames", own, (), FORMAT_VERSIONS["frames"])
+
+    @property
+    def draft(self) -> Path:
+        return self.folder.with_name(f".{self.folder.name}.building")
+
+    def finished(self) -> bool:
+        """Whether the folder holds the store of these inputs; a damaged one becomes a draft, to be cleared away.
+
+        Raises BadInputError when it holds something else.
+        """
+        if not self.folder.exists():
+            return False
+        try:
+            inputs = open_frames(self.folder, check=True).manifest["inputs"]
+        except DamagedFramesError:
+            shutil.rmtree(self.draft, ignore_errors=True)
+            self.folder.rename(self.draft)
+            return False
+        if inputs != self.inputs:
+            raise BadInputError(
+                f"{self.folder} holds frames of other settings or drives; delete it or name another folder"
+            )
+        return True
+
+    def flow(self) -> Flow[None]:
+        plan = yield from self._plan()
+        self._allocate(plan)
+        parts = yield from self._render(plan)
+        manifest = {
+            "schema_version": SCHEMA_VERSION,
+            "key": self.given_key or self.inputs,
+            "inputs": self.inputs,
+            "digest": content_key("store", [[plan[name]["columns"], parts[name]] for name in SETS], (), SCHEMA_VERSION),
+            "settings": {
+                "frames": self.frames.model_dump(mode="json", exclude={"unit"}),
+                "birdview": self.birdview.model_dump(mode="json"),
+            },
+            "sources": self.sources,
+            "sets": {
+                name: plan[name]
+                | {
+                    "arrays": {
+                        key: {"shape": [plan[name]["frames"], *shape], "dtype": "uint8"}
+                        for key, shape in SHAPES.items()
+                    },
+                    "parts": parts[name],
+                }
+                for name in SETS
+            },
+        }
+        _write_json(self.draft / "manifest.json", manifest)
+        (self.draft / "plan.json").unlink()
+        shutil.rmtree(self.draft / PARTS)
+        self.draft.rename(self.folder)
+
+    def _plan(self) -> Flow[dict[str, Any]]:
+        """Choose the frames, or take up the choice of a build that was killed. The draft holds the labels then."""
+        path = self.draft / "plan.json"
+        if path.is_file():
+            plan: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+            labels = {name: self.draft / name / "labels.parquet" for name in SETS}
+            if plan["inputs"] == self.inputs and all(
+                file_digest(labels[name]) == plan[name]["labels"] for name in SETS
+            ):
+                return plan
+        if self.draft.exists():
+            shutil.rmtree(self.draft)
+        self._check_room()
+        tables: list[Columns] = yield Batch(
+            [
+                Task(SELECT, candidates, (path, number, name, self.frames, self.birdview))
+                for name in SETS
+                for number, path in enumerate(self.paths[name])
+            ]
+        )
+        plan = {"inputs": self.inputs}
+        first = 0
+        for name, wanted in (("encoder", self.frames.encoder), ("policy", self.frames.policy)):
+            last = first + len(self.paths[name])
+            columns = {key: np.concatenate([table[key] for table in tables[first:last]]) for key in LABELS}
+            first = last
+            rows, train, test_drives = choose(columns, name, wanted, len(self.paths[name]), self.frames)
+            before = histograms(columns, np.ones(len(columns["step"]), bool))
+            chosen = {key: values[rows] for key, values in columns.items()} | {"train": train}
+            (self.draft / name).mkdir(parents=True)
+            pd.DataFrame(chosen).to_parquet(self.draft / name / "labels.parquet", index=False)
+            plan[name] = {
+                "frames": len(rows),
+                "train": int(train.sum()),
+                "test": int((~train).sum()),
+                "test_drives": test_drives,
+                "labels": file_digest(self.draft / name / "labels.parquet"),
+                "columns": hashlib.sha256(b"".join(chosen[key].tobytes() for key in LABELS)).hexdigest(),
+                "candidates": before,
+                "chosen": {"all": histograms(chosen, np.ones(len(rows), bool))}
+                | {split: histograms(chosen, train == (split == "train")) for split in ("train", "test")},
+            }
+        _write_json(path, plan)
+        return plan
+
+    def _check_room(self) -> None:
+        each = sum(int(np.prod(shape)) for shape in SHAPES.values()) + 60
+        need = (self.frames.encoder + self.frames.policy) * each
+        free = shutil.disk_usage(self.folder.parent).free
+        if need > free:
+            raise BadInputError(
+                f"{self.folder.parent} has {size(free)} free and the frames need {size(need)}: free some "
+                "room, name another folder, or lower --frames.encoder and --frames.policy"
+            )
+
+    def _allocate(self, plan: dict[str, Any]) -> None:
+        """Take the whole room at once, so that a full disk shows now and not in an hour."""
+        for name in SETS:
+            for key, shape in SHAPES.items():
+                path = self.draft / name / f"{key}.npy"
+                whole = (plan[name]["frames"], *shape)
+                length = _header(whole) + int(np.prod(whole))
+                if not (path.is_file() and path.stat().st_size == length):
+                    shutil.rmtree(self.draft / PARTS, ignore_errors=True)
+                    np.lib.format.open_memmap(path, mode="w+", dtype=np.uint8, shape=whole)
+                with path.open("r+b") as stream:
+                    os.posix_fallocate(stream.fileno(), 0, length)
+
+    def _render(self, plan: dict[str, Any]) -> Flow[dict[str, list[dict[str, Any]]]]:
+        (self.draft / PARTS).mkdir(exist_ok=True)
+        tasks: list[Task] = []
+        notes: list[Path] = []
+        done = 0
+        for name in SETS:
+            labels = pd.read_parquet(self.draft / name / "labels.parquet")
+            episode, step, agent = (labels[key].to_numpy() for key in ("episode", "step", "agent"))
+            starts = np.flatnonzero(np.diff(episode, prepend=-1))
+            for start, end in zip(starts.tolist(), [*starts[1:].tolist(), len(episode)], strict=True):
+                notes.append(self.draft / PARTS / f"{name}-{start:09d}.json")
+                if notes[-1].is_file():
+                    done += end - start
+                    continue
+                moments = np.stack([step[start:end], agent[start:end]], axis=1)
+                part = (self.paths[name][episode[start]], self.birdview, moments, self.draft / name, start)
+                tasks.append(Task(RENDER, _render_part, (*part, plan[name]["frames"], notes[-1]), end - start))
+        yield Batch(tasks, done)
+        parts: dict[str, list[dict[str, Any]]] = {name: [] for name in SETS}
+        for note in notes:  # in the order of their rows
+            parts[note.name.partition("-")[0]].append(json.loads(note.read_text(encoding="utf-8")))
+        return parts
+
+
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    draft = path.with_suffix(".draft")
+    with draft.open("w", encoding="utf-8") as stream:
+        json.dump(content, stream, indent=1, allow_nan=False)
+        stream.flush()
+        os.fsync(stream.fileno())
+    draft.replace(path)
+
+
+def _header(shape: tuple[int, ...]) -> int:
+    """Bytes before the numbers in an .npy file of uint8."""
+    stream = io.BytesIO()
+    np.lib.format.write_array_header_1_0(stream, {"descr": "|u1", "fortran_order": False, "shape": shape})
+    return len(stream.getvalue())
+
+
+def _render_part(
+    path: Path,
+    settings: BirdviewSettings,
+    moments: NDArray[np.int32],
+    folder: Path,
+    start: int,
+    frames: int,
+    note: Path,
+) -> None:
+    """Paint frames of one drive, [M, 2] of (step, agent id), into the rows from `start` on, and then note it."""
+    episode = read_episode(path)
+    positions = {agent.id: index for index, agent in enumerate(episode.agents)}
+    where = np.array([(step, positions[agent]) for step, agent in moments.tolist()])
+    renderer = Renderer(episode, settings)
+    digests = {name: hashlib.sha256() for name in SHAPES}
+    with contextlib.ExitStack() as stack:
+        streams = {name: stack.enter_context((folder / f"{name}.npy").open("r+b")) for name in SHAPES}
+        for name, shape in SHAPES.items():
+            streams[name].seek(_header((frames, *shape)) + start * int(np.prod(shape)))
+        for first in range(0, len(where), CHUNK):
+            for name, array in zip(SHAPES, renderer.render(where[first : first + CHUNK]), strict=True):
+                streams[name].write(array.data)
+                digests[name].update(array.data)
+        for stream in streams.values():
+            stream.flush()
+            os.fsync(stream.fileno())  # the note must not tell of rows that a power cut takes back
+    part = {"start": start, "rows": len(where)} | {name: digest.hexdigest() for name, digest in digests.items()}
+    _write_json(note, part)

@@ -1,0 +1,195 @@
+"""Preview: a contact sheet of frames with their targets and labels, and one drive in motion.
+
+Both lie beside the frames, in `preview/`: `contact.png` shows training frames of both sets; `drive.gif` follows one
+vehicle of one drive, in real time, in bird view as the encoder sees it and on the map of the whole town.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from study.config.paper import ACCELERATIONS, IMAGE
+from study.config.settings import BirdviewSettings
+from study.data.birdview import Renderer, governing_light
+from study.data.frames import Frames, FrameStore, unpack_masks
+from study.data.selection import SETS
+from study.episode.files import read_episode
+from study.episode.schema import GREEN, Episode
+from study.errors import BadInputError
+from study.figures.pictures import contact_sheet
+from study.figures.style import write
+from study.products import atomic_folder
+
+FILES = ("contact.png", "drive.gif")
+SHOWN = 12  # frames of each set on the contact sheet
+SECONDS, EVERY = 24.0, 2  # of the drive that are shown, and every how many steps
+LARGER = 4  # pixels of the film for one of the bird view
+SIDE, GAP = 512, 8  # of the map in the film [px]
+COLOURS = 128  # one palette for the whole film: what does not change need not be stored again
+
+GROUND, ROAD, OTHERS, EGO, TEXT = (20, 20, 20), (80, 80, 80), (255, 225, 0), (90, 150, 255), (230, 230, 230)
+LIGHTS = ((0, 220, 0), (255, 200, 0), (255, 40, 40))  # green, yellow, red
+
+Pixels = NDArray[np.float64]
+
+
+def write_preview(store: FrameStore, drives: Sequence[Path], folder: Path) -> tuple[Path, ...]:
+    """Write both files below `folder`, whole or not at all, and return them; the film is of the first of `drives`.
+
+    Raises BadInputError when there is no drive or it cannot be read.
+    """
+    if not drives:
+        raise BadInputError(
+            f"none of the drives that {folder} was made from is there any more: "
+            "delete that folder and build it again, then the drives are recorded too"
+        )
+    birdview = BirdviewSettings.model_validate(store.manifest["settings"]["birdview"])
+    with atomic_folder(folder / "preview") as draft:
+        sets = {name: sample(getattr(store, name), number) for number, name in enumerate(SETS)}
+        write(contact_sheet(sets), draft / FILES[0])
+        write_film(read_episode(drives[0]), birdview, draft / FILES[1])
+    return tuple(folder / "preview" / name for name in FILES)
+
+
+# --- contact sheet --------------------------------------------------------------------------------------------------
+
+
+def sample(frames: Frames, seed: int, count: int = SHOWN) -> list[tuple[str, NDArray[np.uint8]]]:
+    """Random training frames: label in words, and input, pred and plan as [3, 64, 64, 3] uint8."""
+    rows = np.sort(np.random.default_rng([seed]).permutation(frames.indices("train"))[:count])
+    masks = np.repeat(unpack_masks(frames.masks[rows])[..., None] * np.uint8(255), 3, axis=4)
+    pictures = np.concatenate([frames.images[rows][:, None], masks], axis=1)
+    return [(label_text(frames, row), picture) for row, picture in zip(rows.tolist(), pictures, strict=True)]
+
+
+def label_text(frames: Frames, row: int) -> str:
+    """The labels of a frame in two short lines."""
+    label = frames.labels.iloc[row]
+    light = ("no red light", "yellow", "red")[int(label["light"])]
+    light += f" in {label['light_distance']:.0f} m" if label["light"] else ""
+    free = "way free" if np.isnan(label["lead_gap"]) else f"gap {label['lead_gap']:.0f} m"
+    command = f"command {ACCELERATIONS[int(label['acceleration'])]:g}, steering {label['steering']:+.3f}"
+    return f"{command}\n{label['speed']:.1f} m/s, {light}, {free}"
+
+
+# --- film -----------------------------------------------------------------------------------------------------------
+
+
+def choose_ego(episode: Episode) -> tuple[int, NDArray[np.int64]]:
+    """The vehicle to follow, as an agent index, and its steps: there the longest, then past most lights, then farthest.
+
+    Raises BadInputError when no vehicle may be ego.
+    """
+    most = round(SECONDS * episode.rate_hz)
+    best: tuple[tuple[float, ...], int] | None = None
+    for index, agent in enumerate(episode.agents):
+        steps = np.flatnonzero(episode.present[:, index])[:most]
+        if not agent.ego or not len(steps):
+            continue
+        lights = np.count_nonzero(np.diff(episode.light[steps, index]))
+        score = (len(steps), float(lights), float(np.abs(episode.speed[steps, index]).sum()))
+        if best is None or score > best[0]:
+            best = (score, index)
+    if best is None:
+        raise BadInputError(f"Episode {episode.id} has no vehicle that may be ego; take another drive")
+    return best[1], np.flatnonzero(episode.present[:, best[1]])[:most:EVERY]
+
+
+def write_film(episode: Episode, birdview: BirdviewSettings, path: Path) -> None:
+    """Write the film of one vehicle's drive as a GIF. Raises BadInputError for an Episode that has no ego."""
+    ego, steps = choose_ego(episode)
+    views, _ = Renderer(episode, birdview).render(np.stack([steps, np.full(len(steps), ego)], axis=1))
+    frames = [
+        _frame(view, picture, episode, ego, step)
+        for view, picture, step in zip(views, _maps(episode, birdview, ego, steps), steps.tolist(), strict=True)
+    ]
+    some = frames[:: max(len(frames) // 8, 1)]
+    sheet = Image.new("RGB", (some[0].width, some[0].height * len(some)))
+    for number, frame in enumerate(some):
+        sheet.paste(frame, (0, number * frame.height))
+    palette = sheet.quantize(COLOURS)
+    flat = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    flat[0].save(
+        path,
+        format="GIF",
+        save_all=True,
+        append_images=flat[1:],
+        duration=round(1000 * EVERY / episode.rate_hz),
+        loop=0,
+    )
+
+
+def _frame(view: NDArray[np.uint8], chart: Image.Image, episode: Episode, ego: int, step: int) -> Image.Image:
+    """Bird view and words on the left, map on the right."""
+    left = IMAGE * LARGER
+    whole = Image.new("RGB", (left + GAP + SIDE, SIDE), GROUND)
+    whole.paste(Image.fromarray(view.repeat(LARGER, axis=0).repeat(LARGER, axis=1)), (0, 0))
+    whole.paste(chart, (left + GAP, 0))
+    steering, command = episode.steering[step, ego], episode.acceleration[step, ego]
+    words = (
+        f"drive {episode.id}, vehicle {episode.agents[ego].id}\n"
+        f"{step / episode.rate_hz:.1f} s\n{abs(episode.speed[step, ego]):.1f} m/s\n"
+        f"command {command:g}, steering {steering:+.3f}\n\n"
+        "map: the vehicle of the picture above\n(blue) with its route, which is red\nwhere its light is not green"
+    )
+    font = ImageFont.load_default(13)
+    ImageDraw.Draw(whole).multiline_text((GAP, left + GAP), words, fill=TEXT, font=font, spacing=5)
+    return whole
+
+
+def _maps(episode: Episode, birdview: BirdviewSettings, ego: int, steps: NDArray[np.int64]) -> Iterator[Image.Image]:
+    """The whole map at each step: roads, lights, the ego's route from where it is on, vehicles."""
+    there = episode.present
+    points = [lane.centre for lane in episode.lanes] or [np.stack([episode.x[there], episode.y[there]], axis=1)]
+    low, high = (np.asarray(end(np.concatenate(points), axis=0), float) for end in (np.min, np.max))
+    scale = (SIDE - 3 * GAP) / max(float((high - low).max()), 1.0)
+    shift = np.array([SIDE / 2, SIDE / 2]) - scale * np.array([1, -1]) * (low + high) / 2
+
+    def pixels(places: NDArray[np.floating]) -> list[tuple[float, float]]:
+        return [(x, y) for x, y in (np.asarray(places, float) * [scale, -scale] + shift).tolist()]
+
+    roads = Image.new("RGB", (SIDE, SIDE), GROUND)
+    draw = ImageDraw.Draw(roads)
+    for lane in episode.lanes:
+        draw.line(pixels(lane.centre), ROAD, max(1, round(lane.width * scale)))
+    lamps = pixels(np.array([light.stop_line.mean(axis=0) for light in episode.lights]).reshape(-1, 2))
+    states = governing_light(episode, birdview, np.stack([steps, np.full(len(steps), ego)], axis=1))
+    for step, state in zip(steps.tolist(), states.tolist(), strict=True):
+        picture = roads.copy()
+        draw = ImageDraw.Draw(picture)
+        way = _way_ahead(episode, ego, step)
+        if len(way) > 1:
+            draw.line(pixels(way), LIGHTS[0] if state == GREEN else LIGHTS[2], 2)
+        for (x, y), colour in zip(lamps, episode.light_state[step].tolist(), strict=True):
+            draw.ellipse((x - 2, y - 2, x + 2, y + 2), fill=LIGHTS[colour])
+        for index in np.flatnonzero(there[step]).tolist():
+            draw.polygon(pixels(_box(episode, step, index, 5.0 / scale)), EGO if index == ego else OTHERS)
+        ((x, y),) = pixels(np.array([[episode.x[step, ego], episode.y[step, ego]]]))
+        draw.ellipse((x - 9, y - 9, x + 9, y + 9), outline=EGO, width=2)
+        yield picture
+
+
+def _box(episode: Episode, step: int, index: int, least: float) -> Pixels:
+    """Corners [4, 2] m of a vehicle, drawn at least `least` [m] long and half as wide: a dot has no direction."""
+    agent, heading = episode.agents[index], episode.heading[step, index]
+    along = np.array([np.cos(heading), np.sin(heading)]) * max(agent.length, least) / 2
+    across = np.array([-np.sin(heading), np.cos(heading)]) * max(agent.width, least / 2) / 2
+    middle = np.array([episode.x[step, index], episode.y[step, index]])
+    return np.stack(
+        [middle + along + across, middle + along - across, middle - along - across, middle - along + across]
+    )
+
+
+def _way_ahead(episode: Episode, ego: int, step: int) -> Pixels:
+    """The rest [P, 2] m of the ego's route; nothing where route or progress is unknown."""
+    route, progress = episode.routes[ego].astype(float), float(episode.route_s[step, ego])
+    if len(route) < 2 or not np.isfinite(progress):
+        return np.empty((0, 2))
+    length = np.concatenate([[0.0], np.hypot(*np.diff(route, axis=0).T).cumsum()])
+    here = np.array([[np.interp(progress, length, route[:, axis]) for axis in (0, 1)]])
+    return np.concatenate([here, route[length > progress]])

@@ -1,0 +1,195 @@
+"""Selection: which recorded moments become frames, in which split (Sec. IV-A, V; PAPER.md 2.7 to 2.9).
+
+Of each drive come candidates: moments of one vehicle at least `spacing` apart. From the candidates of all drives the
+frames are drawn without replacement: by chance for the encoder set, and for the policy set raked, so that steering
+bins, acceleration classes and standing vehicles have the shares that the settings name (PROTOTYPE.md).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from study.config.paper import ACCELERATIONS, STEERING_CROP
+from study.config.settings import BirdviewSettings, FramesSettings
+from study.data.birdview import governing_light, valid_moments
+from study.episode.files import read_episode
+from study.episode.schema import RATE_HZ
+from study.errors import BadInputError
+
+SETS = ("encoder", "policy")
+STEERING_EDGES = (-0.15, -0.05, -0.01, 0.01, 0.05, 0.15)  # of the bins that the policy set is raked to (PROTOTYPE.md)
+STANDING = 0.1  # [m/s], below it a vehicle stands
+
+LABELS: dict[str, type[np.generic]] = {
+    "episode": np.int32,  # position in the set's list of drives
+    "agent": np.int32,  # the vehicle's id in its Episode
+    "step": np.int32,
+    "train": np.bool_,
+    "steering": np.float32,
+    "acceleration": np.int8,  # class, an index into ACCELERATIONS
+    "speed": np.float32,  # [m/s]
+    "light": np.uint8,  # of the governing light in range: 0 none or green, 1 yellow, 2 red
+    "light_distance": np.float32,  # [m], NaN where there is none
+    "lead_gap": np.float32,  # [m], NaN where the way is free
+    "standing": np.bool_,
+}
+
+# What a random generator is for; with the settings' seed and the set it makes the generator.
+_CANDIDATES, _CHOICE = 0, 1
+
+Indices = NDArray[np.int64]
+Columns = dict[str, NDArray[Any]]
+
+
+def candidates(path: Path, number: int, name: str, frames: FramesSettings, birdview: BirdviewSettings) -> Columns:
+    """Label columns of one drive's candidate moments; runs in a worker.
+
+    Of each vehicle every k-th moment is taken, k the spacing, from a random one on; for the encoder set a standing
+    moment is kept with probability `standing_weight`.
+    """
+    episode = read_episode(path)
+    rng = np.random.default_rng([frames.seed, _CANDIDATES, SETS.index(name), number])
+    every = max(1, int(np.ceil(frames.spacing * RATE_HZ - 1e-9)))
+    phase = rng.integers(every, size=len(episode.agents))
+    moments = valid_moments(episode, birdview)
+    moments = moments[(moments[:, 0] - phase[moments[:, 1]]) % every == 0]
+    if name == "encoder":
+        moving = episode.speed[tuple(moments.T)] >= STANDING
+        moments = moments[moving | (rng.random(len(moments)) < frames.standing_weight)]
+    at = tuple(moments.T)
+    ids = np.array([agent.id for agent in episode.agents], int)
+    columns = {
+        "episode": np.full(len(moments), number),
+        "agent": ids[moments[:, 1]],
+        "step": moments[:, 0],
+        "train": np.ones(len(moments), bool),
+        "steering": episode.steering[at],
+        "acceleration": np.searchsorted(ACCELERATIONS, episode.acceleration[at]),
+        "speed": episode.speed[at],
+        "light": governing_light(episode, birdview, moments),
+        "light_distance": episode.light_distance[at],
+        "lead_gap": episode.lead_gap[at],
+        "standing": episode.speed[at] < STANDING,
+    }
+    return {name: columns[name].astype(kind, copy=False) for name, kind in LABELS.items()}
+
+
+def choose(
+    columns: Columns, name: str, wanted: int, drives: int, settings: FramesSettings
+) -> tuple[Indices, NDArray[np.bool_], list[int]]:
+    """Rows of the chosen candidates, sorted; which of them are for training; the test drives (Sec. V, PAPER.md 2.8)."""
+    rng = np.random.default_rng([settings.seed, _CHOICE, SETS.index(name)])
+    test = round(wanted * settings.test_share)
+    balance = settings.balance if name == "policy" else "none"
+    if settings.split == "frame":
+        rows = _sample(columns, np.arange(len(columns["step"])), wanted, balance, name, "", settings, rng)
+        train = np.ones(wanted, bool)
+        train[rng.permutation(wanted)[:test]] = False
+        return rows, train, []
+    count = min(max(1, round(drives * settings.test_share)), drives - 1)
+    test_drives = np.sort(rng.permutation(drives)[:count])
+    in_test = np.isin(columns["episode"], test_drives)
+    parts = [
+        _sample(columns, np.flatnonzero(pool), number, balance, name, f" {split}", settings, rng)
+        for pool, number, split in ((~in_test, wanted - test, "training"), (in_test, test, "test"))
+    ]
+    rows = np.sort(np.concatenate(parts))
+    return rows, ~in_test[rows], test_drives.tolist()
+
+
+def _sample(
+    columns: Columns,
+    pool: Indices,
+    wanted: int,
+    balance: str,
+    name: str,
+    split: str,
+    settings: FramesSettings,
+    rng: np.random.Generator,
+) -> Indices:
+    """`wanted` rows of the pool without replacement, sorted; raked to the target margins unless `balance` is none."""
+    if wanted > len(pool):
+        raise BadInputError(
+            f"the {name} set needs {wanted}{split} frames and its drives give {len(pool)}: lower "
+            f"--frames.{name} or --frames.spacing, or raise --recording.{name}_episodes or --recording.duration "
+            "(import more drives, if they are yours)"
+        )
+    if balance == "none":
+        return np.sort(rng.permutation(pool)[:wanted])
+    cell, shape, margins = _cells(columns, pool, balance, settings)
+    available = np.bincount(cell, minlength=int(np.prod(shape))).reshape(shape)
+    counts = rake(available, margins, wanted, settings.weight_cap).reshape(-1)
+    order = np.lexsort((rng.random(len(pool)), cell))
+    first = np.searchsorted(cell[order], np.arange(len(counts)))
+    rank = np.arange(len(pool)) - first[cell[order]]
+    return np.sort(pool[order[rank < counts[cell[order]]]])
+
+
+def _cells(
+    columns: Columns, pool: Indices, balance: str, settings: FramesSettings
+) -> tuple[NDArray[np.intp], tuple[int, ...], dict[int, NDArray[np.float64]]]:
+    """Cell number of each row in (steering bin, class, standing), the cells' shape, and target shares by axis."""
+    shape = (len(STEERING_EDGES) + 1, len(ACCELERATIONS), 2)
+    bins = np.digitize(columns["steering"][pool], STEERING_EDGES)
+    cell = np.ravel_multi_index((bins, columns["acceleration"][pool], columns["standing"][pool].astype(int)), shape)
+    middle = len(STEERING_EDGES) // 2
+    steering = np.full(shape[0], (1 - settings.near_zero) / (shape[0] - 1))
+    steering[middle] = settings.near_zero
+    margins = {0: steering}
+    if balance == "all":
+        margins |= {1: np.full(3, 1 / 3), 2: np.array([1 - settings.standing, settings.standing])}
+    return cell, shape, margins
+
+
+def rake(
+    available: NDArray[np.integer[Any]], margins: dict[int, NDArray[np.float64]], wanted: int, cap: float
+) -> NDArray[np.int64]:
+    """How many to take of each cell's `available` so that `wanted` come as near to the target margins as they can.
+
+    Iterative proportional fitting, where no cell gives more than it has or more than `cap` times its proportional
+    share. `margins`: axis -> shares along it. Raises BadInputError when the cap leaves too few.
+    """
+    proportional = available * (wanted / max(int(available.sum()), 1))
+    most = np.minimum(available, np.ceil(cap * proportional))
+    if most.sum() < wanted:
+        raise BadInputError(
+            f"--frames.weight_cap {cap:g} lets {most.sum():.0f} of {wanted} frames be chosen; it must be 1 or more"
+        )
+    counts = np.minimum(proportional, most)
+    for _ in range(500):
+        for axis, shares in margins.items():
+            others = tuple(other for other in range(counts.ndim) if other != axis)
+            have = counts.sum(axis=others, keepdims=True)
+            target = wanted * np.expand_dims(shares, others)
+            counts = np.minimum(counts * (target / np.maximum(have, 1e-12)), most)
+    # Where the targets cannot be met, the rest comes from whatever is left, in proportion.
+    left = most - counts
+    if left.sum() > 0:
+        counts += left * (max(wanted - counts.sum(), 0) / left.sum())
+    whole: NDArray[np.int64] = np.floor(counts + 1e-9).astype(np.int64)
+    missing = wanted - int(whole.sum())
+    rest = np.where(whole < most, counts - whole, -1.0).reshape(-1)
+    whole.reshape(-1)[np.argsort(-rest, kind="stable")[:missing]] += 1
+    return whole
+
+
+def histograms(columns: Columns, rows: NDArray[np.bool_]) -> dict[str, Any]:
+    """What a reader must know of a set's labels: histograms, and the accuracy of always saying the commonest class."""
+    steering, standing = columns["steering"][rows], columns["standing"][rows]
+    classes = np.bincount(columns["acceleration"][rows], minlength=len(ACCELERATIONS))
+    number = max(int(rows.sum()), 1)
+    return {
+        "frames": int(rows.sum()),
+        "drives": len(np.unique(columns["episode"][rows])),
+        "steering_edges": list(STEERING_EDGES),
+        "steering": np.bincount(np.digitize(steering, STEERING_EDGES), minlength=len(STEERING_EDGES) + 1).tolist(),
+        "acceleration": classes.tolist(),
+        "standing": int(standing.sum()),
+        "light": np.bincount(columns["light"][rows], minlength=3).tolist(),
+        "majority_accuracy": float(classes.max() / number),
+        "steering_beyond_crop": float((np.abs(steering) > STEERING_CROP).sum() / number),
+    }

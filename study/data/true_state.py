@@ -1,0 +1,72 @@
+"""The true state in the place of a latent: what policies reach that need no encoder, a ceiling for those that do.
+
+It holds what the expert decides its acceleration by and the image shows (Sec. III-A, IV-C): speed, now and over the
+past second, the light that governs and the way to its stop line, the gap to the vehicle ahead. The speed limit is one
+number for the whole town. There is no route in it, so as a ceiling it is good for acceleration only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from study.config.paper import LATENT
+from study.episode.files import episode_digest, read_episode
+from study.errors import BadInputError
+
+PAST = 10  # steps at 10 Hz: the past second
+FAR = 40.0  # [m] the image's side; what is farther away, or not there, is this far
+# A small network learns thresholds slowly from one number, so each is spread over this many ramps.
+RAMPS = {"speed": 24, "light_distance": 12, "lead_gap": 12}
+
+Array = NDArray[np.float64]
+
+
+def true_state(labels: pd.DataFrame, sources: Sequence[Mapping[str, str]], drives: Path) -> NDArray[np.float32]:
+    """State [N, 64] of the frames with those labels, z-scored over the training frames; columns not needed are 0.
+
+    `sources` lists the set's drives, name and digest, as a frame store's manifest does; they lie in `drives`.
+    Raises BadInputError when a drive is not there or not the same.
+    """
+    train = labels["train"].to_numpy()
+    own = {name: labels[name].to_numpy(np.float64) for name in RAMPS}
+    light = labels["light"].to_numpy()
+    parts = [np.stack([light == state for state in range(3)], axis=1)]
+    for name, count in RAMPS.items():
+        parts += [] if name == "speed" else [np.isnan(own[name])[:, None]]
+        high = float(own[name][train].max()) if name == "speed" else FAR
+        parts.append(_ramps(np.nan_to_num(own[name], nan=FAR), high, count))
+    parts.append(own["speed"][:, None] - _past_speed(labels, sources, drives))
+    values = np.concatenate(parts, axis=1).astype(np.float64)
+    spread = values[train].std(axis=0)
+    scaled = (values - values[train].mean(axis=0)) / np.where(spread > 0, spread, 1.0)
+    return np.pad(scaled, ((0, 0), (0, LATENT - scaled.shape[1]))).astype(np.float32)
+
+
+def _ramps(values: Array, high: float, count: int) -> Array:
+    """[N, count]: which part of each of `count` equal stretches from 0 to `high` a value has covered."""
+    return np.clip(values[:, None] * (count / max(high, 1e-9)) - np.arange(count), 0, 1)
+
+
+def _past_speed(labels: pd.DataFrame, sources: Sequence[Mapping[str, str]], drives: Path) -> Array:
+    """Speed 1 to PAST steps before each frame [N, PAST]; what was not recorded counts as unchanged."""
+    past = np.empty((len(labels), PAST))
+    for number, rows in labels.reset_index(drop=True).groupby("episode"):
+        source = sources[int(str(number))]
+        folder = drives / Path(source["name"]).name
+        if not (folder / "episode.json").is_file() or episode_digest(folder) != source["digest"]:
+            raise BadInputError(
+                f"the ceiling needs the drives that the frames were made from, and {folder} is not there or another; "
+                "delete the frame store to make both again, or leave the ceiling out with --ceiling false"
+            )
+        episode = read_episode(folder)
+        column = {agent.id: place for place, agent in enumerate(episode.agents)}
+        columns = rows["agent"].map(column).to_numpy()[:, None]
+        steps = rows["step"].to_numpy()[:, None] - np.arange(1, PAST + 1)
+        speed = np.where(steps < 0, np.nan, episode.speed[np.maximum(steps, 0), columns])
+        past[rows.index] = np.where(np.isnan(speed), rows["speed"].to_numpy()[:, None], speed)
+    return past

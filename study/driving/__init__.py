@@ -1,0 +1,1 @@
+"""A policy at the wheel: encoder and policy joined to one network."""

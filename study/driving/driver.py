@@ -1,0 +1,65 @@
+"""A trained cell as one network, images in and every policy's answer out, exported to a file without pickle.
+
+The file is torch.export's archive: raw tensors and a graph of torch's own operations as JSON. It needs torch alone to
+run, none of this program, and it cannot carry code; a pickled module, MLflow's other format, can.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from study.encoder.inputs import to_float
+from study.encoder.latents import encoder_of
+from study.policy.networks import WIDTHS, through
+from study.results.cell_result import CellResult
+
+
+class Driver(nn.Module):
+    """An encoder and the S policies on it.
+
+    Images [B, 3, 64, 64] float32 in [0, 1] -> "steering" [S, B] and "acceleration" [S, B, 3] float32, the logits of the
+    classes ACCELERATIONS. Policies speak without dropout.
+    """
+
+    def __init__(self, encoder: Mapping[str, NDArray[Any]], policies: Mapping[str, NDArray[Any]]) -> None:
+        super().__init__()
+        self.encoder = encoder_of(encoder)
+        self.unit_length = bool(policies["z_l2"][0])
+        for name, value in policies.items():
+            if name != "z_l2":
+                self.register_buffer(name, torch.from_numpy(np.array(value)))
+
+    def forward(self, images: Tensor) -> dict[str, Tensor]:
+        """What the policies say of images."""
+        z = (self.encoder(images) - self.get_buffer("z_mean")) / self.get_buffer("z_std")
+        if self.unit_length:
+            z = nn.functional.normalize(z, dim=1, eps=torch.finfo(z.dtype).tiny)
+        said = {
+            name: through(
+                [
+                    (self.get_buffer(f"{name}_{layer}_weight"), self.get_buffer(f"{name}_{layer}_bias")[:, None])
+                    for layer in range(len(widths) - 1)
+                ],
+                z,
+            )
+            for name, widths in WIDTHS.items()
+        }
+        return {"steering": said["steering"][..., 0], "acceleration": said["acceleration"]}
+
+
+def export_driver(result: CellResult) -> bytes:
+    """Return the cell's Driver as a .pt2 archive that takes batches of any size. About a second's work."""
+    driver = Driver(result.encoder, result.policies).eval()
+    images = to_float(torch.from_numpy(result.samples["input"][:1])).repeat(2, 1, 1, 1)  # one would become a constant
+    with torch.no_grad():
+        program = torch.export.export(driver, (images,), dynamic_shapes=({0: torch.export.Dim.DYNAMIC},))
+    archive = io.BytesIO()
+    torch.export.save(program, archive)
+    return archive.getvalue()

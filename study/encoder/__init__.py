@@ -1,0 +1,1 @@
+"""The multi-head autoencoder (Sec. III-B, IV-B) and its training."""

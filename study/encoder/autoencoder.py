@@ -1,0 +1,195 @@
+"""Encoders trained with one, two or three decoder heads (Sec. III-B, IV-B), and the latents of a trained one.
+
+The main path is `train_encoder`: Lightning's Trainer over batches that are slices of one uint8 array. Images lie in the
+store as [N, 64, 64, 3], which is channels-last memory already; masks stay packed bits until they are on the device.
+A killed training goes on from its checkpoint and, on a CPU, ends with the bytes of one that was never killed.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+
+import lightning
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from study.config.heads import HEAD_SETS, HEADS
+from study.config.paper import LATENT
+from study.config.settings import EncoderSettings
+from study.encoder.inputs import MASKS, Split, to_float, unpack
+from study.encoder.networks import PIXELS, Decoder, Encoder, initialise, seeded_generator
+from study.errors import one_of
+
+
+class MultiHeadAutoencoder(lightning.LightningModule):
+    """An encoder and the decoder heads of a head set, with the loss that trains them (Sec. III-B).
+
+    The loss is the weighted sum over heads of the binary cross-entropy on logits, mean over a head's pixels. With
+    `beta` > 0 comes beta times the Kullback-Leibler divergence of z from N(0, 1), divided by the image's 12,288
+    numbers, so that beta = 1 is the evidence lower bound of `rec`. Losses are averaged over each epoch and split in
+    `means`, on the device: Lightning's own logging would wait for the device at every step.
+    Raises BadInputError for an unknown head set.
+    """
+
+    def __init__(self, heads: str, settings: EncoderSettings, encoder_seed: int) -> None:
+        super().__init__()
+        if heads not in HEAD_SETS:
+            raise one_of("head set", heads, HEAD_SETS)
+        self.settings, self.beta = settings, settings.beta
+        self.head_weights = {head: settings.head_weights.get(head, 1.0) for head in HEAD_SETS[heads]}
+        self.automatic_optimization = False  # gradients come head by head, see `losses`
+        self.encoder = Encoder(variational=settings.beta > 0)
+        self.decoders = nn.ModuleDict({head: Decoder(HEADS[head]) for head in HEAD_SETS[heads]})
+        initialise(self.encoder, seeded_generator(encoder_seed, "encoder"))
+        for head, decoder in self.decoders.items():
+            initialise(decoder, seeded_generator(encoder_seed, f"decoder {head}"))
+        self.metrics = ("loss", *(f"loss_{head}" for head in self.decoders), *(["loss_kl"] if settings.beta else []))
+        self.noise_seed = encoder_seed
+        self.noise: torch.Generator | None = None
+        self.noise_state: Tensor | None = None  # to start from, when a training goes on
+        self._fused: _Fused | None = None
+        self.reset_means()
+
+    def forward(self, images: Tensor) -> dict[str, Tensor]:
+        """Logits of each head for images [B, 3, 64, 64] float in [0, 1]."""
+        z = self.encoder(images)
+        return {head: decoder(z) for head, decoder in self.decoders.items()}
+
+    def losses(self, images: Tensor, masks: Tensor, noise: Tensor | None = None, *, by_head: bool = False) -> Tensor:
+        """The losses named in `metrics`, of images [B, 64, 64, 3] uint8 and masks [B, 2, 512] uint8.
+
+        `noise` [B, 64] float32 moves z within its variance, when variational. The losses carry gradients. With
+        `by_head` they carry none: those of the total loss are added to the parameters' on the way, one head after the
+        other, so that memory for the activations of one head suffices.
+        """
+        pixels = to_float(images)
+        targets = {"rec": pixels} | unpack(masks, [head for head in self.decoders if head in MASKS])
+        features = self.encoder.features(pixels)
+        z = self.encoder.mean(features)
+        ends: list[tuple[Tensor, Tensor | None]] = []  # of the encoder's graph, with the gradient that comes in there
+        divergence = []
+        if self.encoder.log_variance is not None:
+            mean, log_variance = z.float(), self.encoder.log_variance(features).float()
+            kl = (mean.square() + log_variance.exp() - 1 - log_variance).sum(1).mean() / (2 * PIXELS)
+            divergence.append(kl.detach() if by_head else kl)
+            ends.append((self.beta * kl, None))
+            if noise is not None:  # on the test split the mean stands for z, as for the policies
+                z = mean + torch.exp(log_variance / 2) * noise
+        given = z.detach().requires_grad_() if by_head else z
+        parts = []
+        weights = [self.head_weights[head] for head in self.decoders]
+        for weight, (head, decoder) in zip(weights, self.decoders.items(), strict=True):
+            loss = functional.binary_cross_entropy_with_logits(decoder(given), targets[head])
+            if by_head:
+                torch.autograd.backward(weight * loss)
+            parts.append(loss.detach() if by_head else loss)
+        if by_head:
+            outputs, incoming = zip(*ends, (z, given.grad), strict=True)
+            torch.autograd.backward(outputs, incoming)
+        weights += [self.beta] * len(divergence)
+        parts += divergence
+        return torch.stack([sum(w * part for w, part in zip(weights, parts, strict=True)), *parts])  # type: ignore[list-item]
+
+    def _noise(self, count: int) -> Tensor | None:
+        if not self.beta:
+            return None
+        if self.noise is None:
+            self.noise = seeded_generator(self.noise_seed, "noise", self.device)
+            if self.noise_state is not None:
+                self.noise.set_state(self.noise_state)
+        return torch.randn((count, LATENT), generator=self.noise, device=self.device)
+
+    def training_step(self, batch: tuple[Tensor, Tensor]) -> None:
+        """One step of the optimiser."""
+        optimizer = self.optimizers(use_pl_optimizer=False)
+        assert isinstance(optimizer, torch.optim.Optimizer)
+        optimizer.zero_grad()
+        self._note("train", self.gradients(*batch, self._noise(len(batch[0]))), len(batch[0]))
+        optimizer.step()
+
+    def validation_step(self, batch: tuple[Tensor, Tensor]) -> None:
+        """Losses of a batch of the test split."""
+        losses = self._fused(*batch, None) if self._fused else None
+        self._note("test", self.losses(*batch) if losses is None else losses, len(batch[0]))
+
+    def gradients(self, images: Tensor, masks: Tensor, noise: Tensor | None) -> Tensor:
+        """The losses of a batch, as `losses` has them; adds the gradients of their total to the parameters'."""
+        losses = self._fused(images, masks, noise) if self._fused else None
+        return self.losses(images, masks, noise, by_head=True) if losses is None else losses
+
+    def fuse(self) -> None:
+        """From now on take losses and gradients by torch.compile, where that works."""
+        self._fused = _Fused(self)
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        """Adam (Sec. IV-B)."""
+        return torch.optim.Adam(self.parameters(), lr=self.settings.lr, fused=True)
+
+    def _note(self, split: Split, losses: Tensor, count: int) -> None:
+        weighted = torch.cat([losses, losses.new_ones(1)]).double() * count
+        self.sums[split] = self.sums[split].to(losses.device, non_blocking=True) + weighted
+        self.totals[split].append(losses[0])
+
+    def reset_means(self) -> None:
+        """Forget the losses seen."""
+        self.sums = {name: torch.zeros(len(self.metrics) + 1, dtype=torch.float64) for name in ("train", "test")}
+        self.totals: dict[str, list[Tensor]] = {"train": [], "test": []}
+
+    def means(self) -> dict[str, float]:
+        """Mean of each loss over the frames seen since the last reset, e.g. "train/loss_rec"; waits for the device."""
+        found: dict[str, float] = {}
+        rows = torch.stack([sums.to(self.device) for sums in self.sums.values()]).tolist()
+        for split, (*values, count) in zip(self.sums, rows, strict=True):
+            found |= {f"{split}/{name}": value / count for name, value in zip(self.metrics, values, strict=True)}
+        return found
+
+    def not_finite(self, split: Split) -> int:
+        """Position since the last reset of the first batch whose loss was not a finite number; there is one."""
+        return int(torch.stack(self.totals[split]).isfinite().int().argmin())
+
+
+class _Fused:
+    """An autoencoder's losses and their gradients by torch.compile: one graph for each size of batch and each split.
+
+    A call gives the losses, and in training adds the gradients; or None where it cannot compile, which it says once.
+    """
+
+    def __init__(self, module: MultiHeadAutoencoder) -> None:
+        torch.compiler.reset()  # graphs of an encoder trained before would count against the limit
+        self.module = module
+        self.function: Callable[..., Tensor] | None = torch.compile(module.losses, dynamic=False, fullgraph=True)
+        self.compiled: set[tuple[int, bool]] = set()  # sizes, each in training or not
+
+    def __call__(self, *batch: Tensor | None) -> Tensor | None:
+        kind = len(batch[0]), self.module.training  # type: ignore[arg-type]
+        if self.function is None or kind in self.compiled:
+            return self._compute(*batch)
+        before = [buffer.clone() for buffer in self.module.buffers()]
+        try:
+            losses = self._compute(*batch)
+        except torch.OutOfMemoryError:
+            raise
+        except Exception as error:  # noqa: BLE001 - of any kind; what else may be wrong shows without it
+            warnings.warn(
+                f"torch.compile failed ({type(error).__name__}: {str(error).strip().splitlines()[0]}); the encoder "
+                "trains without it, more slowly (TORCH_COMPILE_DISABLE=1 leaves it out)",
+                RuntimeWarning,
+                stacklevel=2,
+            )
+            self.function = None
+            self.module.zero_grad()
+            for buffer, value in zip(self.module.buffers(), before, strict=True):
+                buffer.copy_(value)
+            return None
+        self.compiled.add(kind)
+        return losses
+
+    def _compute(self, *batch: Tensor | None) -> Tensor | None:
+        if self.function is None:
+            return None
+        losses = self.function(*batch)
+        if self.module.training:
+            torch.autograd.backward(losses[0])
+        return losses.detach()

@@ -1,0 +1,80 @@
+"""Encode frames with a trained encoder, and paint sample reconstructions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from numpy.typing import NDArray
+
+from study.compute.device import check_device
+from study.config.paper import LATENT
+from study.data.frames import Frames
+from study.encoder.autoencoder import MultiHeadAutoencoder
+from study.encoder.inputs import MASKS, Bytes, Indices, to_float, unpack
+from study.encoder.networks import Encoder
+from study.errors import BadInputError
+from study.products import Arrays
+
+SAMPLES = 16
+
+
+def choose_samples(frames: Frames) -> Indices:
+    """Rows of up to 16 test frames to show, the same for every encoder: those with most to see, drive by drive.
+
+    A frame's content is the mean of two ranks among the test frames: set pixels in its pred and in its plan mask.
+    """
+    test = frames.indices("test")
+    pixels = np.bitwise_count(frames.masks[test]).sum(axis=2, dtype=np.int64)
+    content = pd.DataFrame(pixels).rank().sum(axis=1)
+    table = pd.DataFrame({"row": test, "drive": frames.labels["episode"].to_numpy()[test], "content": content})
+    table = table.sort_values(["content", "row"], ascending=[False, True])
+    table["turn"] = table.groupby("drive").cumcount()
+    chosen = table.sort_values("turn", kind="stable")["row"].head(SAMPLES)
+    return np.sort(chosen.to_numpy(np.int64))
+
+
+def paint_samples(module: MultiHeadAutoencoder, frames: Frames, rows: Indices) -> Arrays:
+    """Inputs, each head's outputs and targets of some frames, uint8, as `CellResult.samples` documents."""
+    images, masks = torch.from_numpy(frames.images[rows]), torch.from_numpy(frames.masks[rows])
+    module.eval()
+    with torch.inference_mode():
+        outputs = {head: logits.sigmoid() for head, logits in module(to_float(images)).items()}
+    samples = {"input": images.numpy()}
+    for head, output in outputs.items():
+        painted = output.mul(255).round().to(torch.uint8).permute(0, 2, 3, 1)
+        samples[f"{head}_output"] = painted.squeeze(-1).contiguous().numpy()
+    for head, target in unpack(masks, [head for head in outputs if head in MASKS]).items():
+        samples[f"{head}_target"] = target.mul(255).to(torch.uint8).squeeze(1).numpy()
+    return samples
+
+
+def encoder_of(weights: Mapping[str, NDArray[Any]]) -> Encoder:
+    """The trained network of those weights. Raises BadInputError when they are not an Encoder's."""
+    encoder = Encoder(variational="log_variance.weight" in weights)
+    try:
+        encoder.load_state_dict({name: torch.from_numpy(np.array(value)) for name, value in weights.items()})
+    except (RuntimeError, TypeError) as error:
+        raise BadInputError(f"these are not the weights of an encoder: {error}") from error
+    return encoder.eval()
+
+
+def encode(
+    weights: Mapping[str, NDArray[Any]], images: Bytes, indices: Indices, *, device: str = "cpu", batch: int = 256
+) -> NDArray[np.float32]:
+    """Latents z [N, 64] float32 of some rows of `images` [.., 64, 64, 3] uint8; the mean when variational.
+
+    Always computed in float32, so that z depends on the precision of training only through the weights.
+    Raises BadInputError when the weights are not an Encoder's, or the device is not there.
+    """
+    target = check_device(device)
+    encoder = encoder_of(weights).to(target)
+    z = np.empty((len(indices), LATENT), np.float32)
+    with torch.inference_mode():
+        for start in range(0, len(indices), batch):
+            part = torch.from_numpy(images[indices[start : start + batch]]).to(target)
+            z[start : start + batch] = encoder(to_float(part)).float().numpy(force=True)
+    return z

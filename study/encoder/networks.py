@@ -1,0 +1,152 @@
+"""Networks of the encoder and its decoder heads (Sec. III-B)."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import math
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from study.config.heads import HEADS
+from study.config.paper import CHANNELS, CORE, IMAGE, KERNEL, LATENT, STRIDE
+
+_CORE_NUMBERS = CHANNELS[-1] * CORE * CORE
+PIXELS = HEADS["rec"] * IMAGE * IMAGE
+
+
+class _Convolution(nn.Conv2d):
+    """A convolution before a BatchNorm, which takes its bias away again: the bias has no gradient to wait for."""
+
+    def forward(self, input: Tensor) -> Tensor:  # noqa: A002 - torch's name
+        assert self.bias is not None
+        return functional.conv2d(input, self.weight, self.bias.detach(), self.stride)
+
+
+class _SubPixel(torch.autograd.Function):
+    """A transposed convolution, kernel 4 and stride 2, as a 2x2 convolution to four times the channels.
+
+    Each input pixel's four outputs are computed side by side and then interleaved: on a CPU about twice as fast as
+    oneDNN's own, which is slow with few output channels and with output padding. Backward, oneDNN's own is fast.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, images: Tensor, weight: Tensor, bias: Tensor, extra: int) -> Tensor:
+        """Images [B, C, H, W], weight [C, D, 4, 4], bias [D]; [B, D, 2 H + 2 + extra, ..] channels last."""
+        ctx.save_for_backward(images, weight)
+        ctx.extra = extra
+        channels = weight.shape[1]
+        corners = weight.reshape(*weight.shape[:2], 2, 2, 2, 2).flip(2, 4)  # the kernel's halves, then odd and even
+        kernels = corners.permute(3, 5, 1, 0, 2, 4).flatten(0, 2)
+        blocks = functional.conv2d(images, kernels, bias.repeat(4), padding=1).permute(0, 2, 3, 1)
+        rows, columns = blocks.shape[1:3]
+        output = blocks.new_empty(len(images), 2 * rows + extra, 2 * columns + extra, channels)
+        output[:, 2 * rows :] = bias  # out of every kernel's reach
+        output[:, :, 2 * columns :] = bias
+        inside = output[:, : 2 * rows, : 2 * columns].view(-1, rows, 2, columns, 2, channels)
+        inside.copy_(blocks.reshape(-1, rows, columns, 2, 2, channels).permute(0, 1, 3, 2, 4, 5))
+        return output.permute(0, 3, 1, 2)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        """Gradients of images and weight."""
+        images, weight = ctx.saved_tensors
+        two, none, one, extra, transposed = [STRIDE] * 2, [0, 0], [1, 1], [ctx.extra] * 2, True
+        of_images, of_weight, _ = torch.ops.aten.convolution_backward(
+            gradients[0], images, weight, None, two, none, one, transposed, extra, 1, [True, True, False]
+        )
+        return of_images, of_weight, None, None
+
+
+def _transposed(layer: nn.ConvTranspose2d, images: Tensor, bias: Tensor) -> Tensor:
+    """A layer's output with another bias in its place, which gets no gradient."""
+    extra = layer.output_padding[0]
+    if images.device.type == "cpu":
+        # Autocast does not look into the function: the layer computes in the type that it is given.
+        output: Tensor = _SubPixel.apply(  # type: ignore[no-untyped-call]
+            images, layer.weight.to(images.dtype), bias.to(images.dtype), extra
+        )
+        return output
+    return functional.conv_transpose2d(images, layer.weight, bias, STRIDE, output_padding=extra)
+
+
+class _TransposedConvolution(nn.ConvTranspose2d):
+    """The same, transposed. Here the bias' gradient, zero but for rounding, took half of the backward time on a CPU."""
+
+    def forward(self, input: Tensor, output_size: list[int] | None = None) -> Tensor:  # noqa: A002, ARG002
+        assert self.bias is not None
+        return _transposed(self, input, self.bias.detach())
+
+
+class Encoder(nn.Module):
+    """Images to z: three convolutions and a fully connected layer (Sec. IV-B).
+
+    Input [B, 3, 64, 64] float in [0, 1], output z [B, 64]. With `variational`, one more layer gives log variances.
+    """
+
+    def __init__(self, variational: bool = False) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        for before, after in itertools.pairwise((HEADS["rec"], *CHANNELS)):
+            layers += [_Convolution(before, after, KERNEL, STRIDE), nn.BatchNorm2d(after), nn.ReLU(inplace=True)]
+        self.convolutions = nn.Sequential(*layers)
+        self.mean = nn.Linear(_CORE_NUMBERS, LATENT)
+        self.log_variance = nn.Linear(_CORE_NUMBERS, LATENT) if variational else None
+
+    def features(self, images: Tensor) -> Tensor:
+        """What the fully connected layers see: [B, 4608], pixel by pixel, as channels-last memory has it."""
+        features: Tensor = self.convolutions(images)
+        return features.permute(0, 2, 3, 1).flatten(1)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """The latent; its mean when variational."""
+        z: Tensor = self.mean(self.features(images))
+        return z
+
+
+class Decoder(nn.Module):
+    """z [B, 64] to the logits [B, channels, 64, 64] of one head, in float32: the encoder backwards (Sec. IV-B)."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.fully_connected = nn.Sequential(
+            nn.Linear(LATENT, _CORE_NUMBERS), nn.BatchNorm1d(_CORE_NUMBERS), nn.ReLU(inplace=True)
+        )
+        layers: list[nn.Module] = []
+        # 6 -> 14 -> 31 -> 64 without padding: the middle layer needs one row and column more (PAPER.md 2.2)
+        for (before, after), extra in zip(itertools.pairwise(CHANNELS[::-1]), (0, 1), strict=True):
+            layers += [
+                _TransposedConvolution(before, after, KERNEL, STRIDE, output_padding=extra),
+                nn.BatchNorm2d(after),
+                nn.ReLU(inplace=True),
+            ]
+        self.convolutions = nn.Sequential(*layers)
+        self.output = nn.ConvTranspose2d(CHANNELS[0], channels, KERNEL, STRIDE)
+
+    def forward(self, z: Tensor) -> Tensor:
+        """Logits; a sigmoid makes them the paper's output."""
+        core = self.fully_connected(z).view(-1, CORE, CORE, CHANNELS[-1]).permute(0, 3, 1, 2)
+        # The bias is added in float32, where its gradient is exact, and faster than inside the convolution.
+        assert self.output.bias is not None
+        logits = _transposed(self.output, self.convolutions(core), torch.zeros_like(self.output.bias))
+        return logits.float() + self.output.bias.view(-1, 1, 1)
+
+
+def initialise(network: nn.Module, generator: torch.Generator) -> None:
+    """Draw every layer's weights and biases as torch does by default, U(-1/sqrt(fan in), 1/sqrt(fan in))."""
+    with torch.no_grad():
+        for layer in network.modules():
+            if isinstance(layer, nn.Linear | nn.Conv2d | nn.ConvTranspose2d):
+                bound = 1 / math.sqrt(layer.weight[0].numel())
+                layer.weight.uniform_(-bound, bound, generator=generator)
+                if layer.bias is not None:
+                    layer.bias.uniform_(-bound, bound, generator=generator)
+
+
+def seeded_generator(seed: int, purpose: str, device: torch.device | str = "cpu") -> torch.Generator:
+    """Return the generator of one purpose of a seed."""
+    digest = hashlib.sha256(f"{seed}/{purpose}".encode()).digest()
+    return torch.Generator(device).manual_seed(int.from_bytes(digest[:7], "big"))

@@ -1,0 +1,1 @@
+"""The recorded drive: an open format that any simulator can write."""

@@ -1,0 +1,1 @@
+"""Figures: drawn from plain arrays and tables, by matplotlib alone."""

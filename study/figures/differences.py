@@ -1,0 +1,190 @@
+"""Figures of differences between head sets, encoders and sweeps."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from numpy.typing import NDArray
+
+from study.config.paper import ACCELERATIONS
+from study.figures.style import COLOUR, GREY, MARKER, SIDES, STYLE, literal, new_figure
+
+
+@mpl.rc_context(STYLE)
+def differences(rows: Sequence[Mapping[str, float | str]], allowance: float) -> Figure:
+    """Draw paired differences in accuracy [points]: thick bar 95 % interval, thin bar simultaneous interval.
+
+    Each row has name, value, low, high, low_all, high_all (shares, not points). The grey zone is the allowance for
+    other encoders, 0 for none.
+    """
+    figure, (axes,) = new_figure(0.7 + 0.24 * len(rows))
+    axes.axvspan(-100 * allowance, 100 * allowance, color=GREY, alpha=0.15, linewidth=0)
+    value, low, high, least, most = _columns(rows, ("value", "low", "high", "low_all", "high_all"))
+    places = np.arange(len(rows))
+    axes.hlines(places, least, most, color=COLOUR["rec+plan"], linewidth=0.8)
+    axes.hlines(places, low, high, color=COLOUR["rec+plan"], linewidth=2.6)
+    axes.plot(value, places, "o", color=COLOUR["rec"], markersize=3.5)
+    _difference_axes(axes, [str(row["name"]) for row in rows], (len(rows) - 0.4, -0.6))
+    return figure
+
+
+def _columns(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> list[NDArray[np.float64]]:
+    """Return columns of rows, shares as points."""
+    return [100 * np.array([row[name] for row in rows], np.float64) for name in names]
+
+
+def _difference_axes(axes: Axes, names: Sequence[str], limits: tuple[float, float]) -> None:
+    """Name the rows, from the top down, and mark no difference."""
+    axes.axvline(0, color=GREY, linewidth=0.6, zorder=1)
+    axes.set_yticks(range(len(names)), names)
+    axes.set(ylim=limits, xlabel="difference in acceleration accuracy, test [percentage points]")
+    _without_left_side(axes)
+
+
+def _without_left_side(axes: Axes) -> None:
+    axes.spines["left"].set_visible(False)
+    axes.tick_params(axis="y", length=0)
+
+
+@mpl.rc_context(STYLE)
+def by_encoder(scores: Mapping[str, Sequence[NDArray[np.float64]]]) -> Figure:
+    """Draw the final accuracy of every policy, encoder by encoder, and the means of encoders and head sets.
+
+    `scores`: for each head set, and each of its encoders, the scores of its policies.
+    """
+    figure, (axes,) = new_figure(2.6)
+    place, ticks = 0, []
+    for heads, encoders in scores.items():
+        first = place
+        for policies in encoders:
+            axes.plot([place] * len(policies), 100 * policies, MARKER[heads], color=COLOUR[heads], alpha=0.5)
+            middle = 100 * float(policies.mean())
+            axes.hlines(middle, place - 0.35, place + 0.35, color=COLOUR[heads], linewidth=1.4)
+            place += 1
+        whole = 100 * float(np.mean([policies.mean() for policies in encoders]))
+        axes.hlines(whole, first - 0.5, place - 0.5, color=GREY, linewidth=0.7, linestyle="--")
+        ticks.append(((first + place - 1) / 2, heads))
+        place += 1
+    axes.set_xticks([tick for tick, _ in ticks], [f"{heads}\n(each column an encoder)" for _, heads in ticks])
+    axes.tick_params(axis="x", length=0)
+    axes.set_ylabel("acceleration accuracy, test [%]")
+    return figure
+
+
+@mpl.rc_context(STYLE)
+def confusions(tables: Sequence[tuple[str, NDArray[np.float64]]]) -> Figure:
+    """Draw confusion matrices side by side: a name, and the share [3, 3] of each true class given each class."""
+    names = [f"{value:g}" for value in ACCELERATIONS]
+    figure, panels = new_figure(1.9, columns=len(tables))
+    for panel, (name, table) in zip(panels, tables, strict=True):
+        panel.imshow(table, cmap="Greys", vmin=0, vmax=1)
+        for row, column in np.ndindex(*table.shape):
+            share = float(table[row, column])
+            colour = "white" if share > 0.5 else "black"
+            panel.text(column, row, f"{100 * share:.1f}", ha="center", va="center", color=colour, fontsize=7)
+        panel.set_xticks(range(len(names)), names)
+        panel.set_yticks(range(len(names)), names)
+        panel.set(xlabel="given", title=name)
+    panels[0].set_ylabel("true throttle \N{MINUS SIGN} brake")
+    return figure
+
+
+@mpl.rc_context(STYLE)
+def both_values(rows: Sequence[Mapping[str, Any]], setting: str, values: tuple[str, str]) -> Figure:
+    """Draw differences in accuracy [points] under two values of a setting, with their intervals.
+
+    Each row has name, and here and there with value, low, high (shares, not points).
+    """
+    figure, (axes,) = new_figure(0.75 + 0.34 * len(rows))
+    colours = COLOUR["rec"], COLOUR["full"]
+    for side, value, shift, colour, (marker, fill) in zip(
+        ("here", "there"), values, (-0.14, 0.14), colours, SIDES, strict=True
+    ):
+        middle, low, high = _columns([row[side] for row in rows], ("value", "low", "high"))
+        places = np.arange(len(rows)) + shift
+        axes.hlines(places, low, high, color=colour, linewidth=1.4)
+        style: dict[str, Any] = {"color": colour, "markerfacecolor": fill or colour, "markersize": 4}
+        axes.plot(middle, places, marker, linestyle="none", label=f"{setting} {value}", **style)
+    _difference_axes(axes, [str(row["name"]) for row in rows], (len(rows) - 0.5, -0.5))
+    figure.legend(loc="outside upper right", ncols=2)
+    return figure
+
+
+Range = tuple[float, float | None, float | None]  # a value and the ends of its interval, as shares
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A head set and fraction in two sweeps: None where a sweep has none, or no difference, as the baseline."""
+
+    label: str
+    heads: str
+    fraction: float
+    scores: tuple[Range | None, Range | None]
+    differences: tuple[Range | None, Range | None]
+
+
+@mpl.rc_context(STYLE)
+def two_sweeps(rows: Sequence[Pair], names: tuple[str, str], baselines: tuple[str, str], note: str) -> Figure:
+    """Draw the final accuracy [%] of two sweeps, row by row, beside the differences to each one's baseline [points].
+
+    `names`: what the key says of each sweep; `note`: a line below. Bars are the intervals given. Without any difference
+    there is one panel.
+    """
+    fractions = [row.fraction for row in rows]
+    places = np.cumsum([0.0, *(1.0 if one == other else 1.5 for one, other in itertools.pairwise(fractions))])
+    both = any(row.differences != (None, None) for row in rows)
+    figure, panels = new_figure(1.7 + 0.3 * float(places[-1]), columns=1 + both)
+    for axes, part, spec in zip(panels, ("scores", "differences"), (".1f", "+.2f"), strict=False):
+        for place, row in zip(places, rows, strict=True):
+            axes.axhline(place, color=GREY, alpha=0.25, linewidth=0.4, zorder=0)
+            shift = 0.0 if None in row.scores else 0.2
+            for found, mark, y in zip(getattr(row, part), SIDES, (place - shift, place + shift), strict=True):
+                _dot(axes, found, y, COLOUR.get(row.heads, GREY), mark, spec)
+        axes.set_yticks(places, [literal(row.label) for row in rows] if part == "scores" else [""] * len(rows))
+        axes.set_ylim(places[-1] + 0.6, -0.6)
+        _without_left_side(axes)
+        axes.margins(x=0.12)
+    panels[0].set_title("(a) Final acceleration accuracy, test")
+    panels[0].set_xlabel("accuracy [%]")
+    for axes in panels[1:]:
+        axes.axvline(0, color=GREY, linewidth=0.6)
+        axes.set_title(f"(b) Difference to {literal(' or '.join(dict.fromkeys(baselines)))}")
+        axes.set_xlabel("difference in accuracy [percentage points]")
+    keys = [
+        Line2D([], [], color=COLOUR["rec"], marker=marker, markerfacecolor=fill or COLOUR["rec"], markersize=4)
+        for marker, fill in SIDES
+    ]
+    figure.legend(keys, [literal(name) for name in names], loc="outside upper left")
+    figure.supxlabel(note, x=0.01, ha="left", fontsize=6.5, color=GREY)
+    return figure
+
+
+def _dot(axes: Axes, found: Range | None, y: float, colour: str, mark: tuple[str, str | None], spec: str) -> None:
+    """Draw a value with its interval, and its number beside it."""
+    if found is None:
+        return
+    value, low, high = (math.nan if end is None else 100 * end for end in found)
+    axes.hlines(y, low, high, color=colour, linewidth=1.4)
+    axes.plot([value], [y], mark[0], color=colour, markerfacecolor=mark[1] or colour, markersize=3.6)
+    text, end = format(value, spec), value if math.isnan(high) else high
+    text = text.replace("-", "\N{MINUS SIGN}") if float(text) else text.lstrip("+-")
+    axes.annotate(
+        text,
+        (end, y),
+        (5, 0),
+        textcoords="offset points",
+        color=GREY,
+        va="center",
+        fontsize=6,
+        bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.8},  # above the row's line
+    )

@@ -1,0 +1,90 @@
+"""Colours, sizes and files that all figures share."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+COLOUR = {"rec": "#000000", "rec+pred": "#E69F00", "rec+plan": "#0072B2", "full": "#D55E00"}
+LINE = {"rec": "-", "rec+pred": "-.", "rec+plan": "--", "full": "-"}
+MARKER = {"rec": "o", "rec+pred": "^", "rec+plan": "s", "full": "D"}
+FRACTION_COLOUR = ("#D55E00", "#E69F00", "#009E73", "#56B4E9", "#CC79A7")
+FRACTION_MARKER = ("D", "^", "s", "v", "P")
+LIGHT_COLOUR, LIGHT_WORDS = ("#BBBBBB", "#E69F00", "#D55E00"), ("green or none", "yellow", "red")
+SIDES = (("o", None), ("D", "white"))  # marker and fill of the first of two sweeps, and of the second
+GREY = "#666666"
+WIDTH = 6.4  # [in], the report's text width
+STYLE: dict[Any, Any] = {
+    "font.size": 7.5,
+    "font.family": "DejaVu Sans",  # comes with matplotlib, so every machine draws the same
+    "axes.titlesize": 8,
+    "axes.titlelocation": "left",
+    "axes.labelsize": 7.5,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.6,
+    "axes.edgecolor": "#444444",
+    "xtick.labelsize": 7,
+    "ytick.labelsize": 7,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "legend.frameon": False,
+    "lines.linewidth": 1.2,
+    "lines.markersize": 3.2,
+    "svg.hashsalt": "study",
+    "svg.fonttype": "path",
+    "figure.dpi": 100,
+}
+METADATA: dict[str, dict[str, None]] = {  # of each format, what would say when and by what it was written
+    "svg": {"Date": None, "Creator": None},
+    "png": {"Software": None},
+    "pdf": {"CreationDate": None, "Creator": None, "Producer": None},
+}
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A figure: its file name, where it belongs in the report, what it shows, and the same in words."""
+
+    name: str
+    place: str
+    caption: str
+    alt: str
+    figure: Figure
+
+
+def save(figure: Figure, folder: Path, name: str) -> tuple[Path, Path]:
+    """Write a figure as `name.svg` and `name.png`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = folder / f"{name}.svg", folder / f"{name}.png"
+    for path in paths:
+        write(figure, path)
+    return paths
+
+
+def write(figure: Figure, path: Path) -> None:
+    """Write a figure whole, in the format of its ending (METADATA; 200 dots per inch), the same bytes each time."""
+    kind, stream = path.suffix[1:].lower(), io.BytesIO()
+    with mpl.rc_context(STYLE):
+        figure.savefig(stream, format=kind, dpi=200, metadata=METADATA[kind])
+    draft = path.with_name(f".{path.name}")
+    draft.write_bytes(stream.getvalue())
+    draft.replace(path)
+
+
+def new_figure(height: float, columns: int = 1, rows: int = 1) -> tuple[Figure, list[Axes]]:
+    """Return a figure as wide as the page, and its axes row by row."""
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False)
+    return figure, list(axes.flat)
+
+
+def literal(text: str) -> str:
+    """Return words from outside, which matplotlib would else read as formulas."""
+    return text.replace("$", r"\$")

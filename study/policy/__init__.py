@@ -1,0 +1,1 @@
+"""Policies on frozen latents (Sec. IV-C): many seeds trained at once."""

@@ -1,0 +1,53 @@
+"""The random numbers of policies: initial weights, data order, dropout."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from study.policy.networks import WIDTHS, WORD, slots
+
+_INIT, _EPOCH, SUBSET = range(3)  # purposes of random numbers
+
+
+class Draws(NamedTuple):
+    """All chance of one epoch: `order` [S, N] int64 and, for each hidden layer, bits [S, N * H / 32] int32."""
+
+    order: Tensor
+    bits: dict[str, tuple[Tensor, Tensor]]
+
+
+def draw_epoch(seeds: Sequence[int], epoch: int, frames: int, device: torch.device | str = "cpu") -> Draws:
+    """The order of the data and the dropout bits of each seed, a function of (seed, epoch) only.
+
+    Made on the CPU whatever the device, so that a seed means the same everywhere; a GPU then copies both arrays while
+    it computes.
+    """
+    words = {name: tuple(width // WORD for width in widths[1:-1]) for name, widths in WIDTHS.items()}
+    ends = np.cumsum([0, *(frames * each for layers in words.values() for each in layers)]).tolist()
+    pinned = torch.device(device).type == "cuda"
+    order = torch.empty((len(seeds), frames), dtype=torch.int64, pin_memory=pinned)
+    bits = torch.empty((len(seeds), ends[-1]), dtype=torch.int32, pin_memory=pinned)
+    orders, random_words = order.numpy(), bits.numpy()
+    for row, seed in enumerate(seeds):
+        rng = np.random.Generator(np.random.SFC64([seed, _EPOCH, epoch]))
+        orders[row] = rng.permutation(frames)
+        random_words[row] = rng.bit_generator.random_raw(math.ceil(ends[-1] / 2)).view(np.int32)[: ends[-1]]
+    there = bits.to(device, non_blocking=True)
+    parts = iter([there[:, a:b] for a, b in itertools.pairwise(ends)])
+    return Draws(order.to(device, non_blocking=True), {name: (next(parts), next(parts)) for name in WIDTHS})
+
+
+def initial_weights(seed: int) -> Iterator[tuple[str, Tensor]]:
+    """One policy's weights by name, as torch's Linear draws them: uniform within 1 / sqrt(inputs)."""
+    rng = np.random.default_rng([seed, _INIT])
+    for name, widths in WIDTHS.items():
+        for slot in slots(name):
+            bound = widths[slot.layer] ** -0.5
+            yield slot.key, torch.from_numpy(rng.uniform(-bound, bound, slot.shape).astype(np.float32))

@@ -1,0 +1,204 @@
+"""Train the policies of a cell."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from numpy.typing import NDArray
+
+from study.compute.trainer import trainer
+from study.config.paper import ACCELERATIONS, LATENT
+from study.config.settings import PolicySettings
+from study.errors import BadInputError, TrainingDivergedError
+from study.policy.draws import SUBSET
+from study.policy.ensemble import PolicyData, PolicyEnsemble
+from study.policy.latents import Arrays, normalisation, normalise
+from study.policy.metrics import METRICS, SPLITS, Labels
+from study.results.cell_result import CURVE_COLUMNS
+
+Log = Callable[[int, dict[str, float]], None]
+Progress = Callable[[int, int], None]
+Labelled = tuple[NDArray[np.float32], pd.DataFrame]  # latents [N, 64] and their labels
+
+
+@dataclass(frozen=True)
+class TrainedPolicies:
+    """S trained policies and how they came about; N test frames.
+
+    `weights`: "<network>_<layer>_weight" [S, in, out] and "..._bias" [S, out] float32 for networks "steering" and
+    "acceleration", layers 0 to 2; "z_mean", "z_std" [64]; "z_l2" [1] uint8: 1 where z is scaled to unit length.
+    `curves`: one row per measured point, columns CURVE_COLUMNS, of the policies without dropout after each epoch.
+    `acceleration` [S, N] uint8 class and `steering` [S, N] float32: on the test frames after the last epoch.
+    """
+
+    weights: Arrays
+    curves: pd.DataFrame
+    acceleration: NDArray[np.uint8]
+    steering: NDArray[np.float32]
+    seconds: float
+
+
+def train_policies(
+    z_train: NDArray[np.float32],
+    z_test: NDArray[np.float32],
+    labels_train: pd.DataFrame,
+    labels_test: pd.DataFrame,
+    seeds: Sequence[int],
+    settings: PolicySettings,
+    *,
+    device: str = "cpu",
+    log: Log | None = None,
+    progress: Progress | None = None,
+) -> TrainedPolicies:
+    """Train one policy per seed on latents [N, 64] float32 and labels with columns "steering" and "acceleration".
+
+    Train metrics are taken on a random part of the train split, the same for all seeds and epochs, that is no larger
+    than the test split. `log(epoch, means over the seeds)` with names such as "test/acceleration_accuracy".
+    Raises BadInputError for data that cannot be learnt from, TrainingDivergedError for a loss that is not finite.
+    """
+    started = time.perf_counter()
+    _check(z_train, z_test, labels_train, labels_test, seeds, settings)
+    scaling = normalisation(z_train, settings.normalise)
+    data = _policy_data(scaling, (z_train, labels_train), (z_test, labels_test), torch.device(device))
+    points: list[pd.DataFrame] = []
+
+    def after_epoch(epoch: int, values: Arrays) -> None:
+        for metrics in values.values():
+            broken = ~np.isfinite(metrics).all(0)
+            if broken.any():
+                raise TrainingDivergedError(
+                    f"policies: the loss of seed {seeds[int(broken.argmax())]} is not finite after epoch {epoch}; "
+                    f"try a lower policy.lr than {settings.lr:g}"
+                )
+        points.append(_points(seeds, epoch, values))
+        if log:
+            log(
+                epoch,
+                {
+                    f"{split}/{metric}": float(each.mean())
+                    for split, metrics in values.items()
+                    for metric, each in zip(METRICS, metrics, strict=True)
+                },
+            )
+        if progress:
+            progress(epoch, settings.epochs)
+
+    with _one_thread():
+        ensemble = PolicyEnsemble(seeds, settings, data, after_epoch)
+        _fit(ensemble, settings, math.ceil(len(data.x) / settings.batch), device)
+        steering, logits = ensemble.outputs(data.views["test"][0])
+    return TrainedPolicies(
+        weights=ensemble.weights() | scaling,
+        curves=pd.concat(points, ignore_index=True)[list(CURVE_COLUMNS)],
+        acceleration=logits.argmax(2).to(torch.uint8).cpu().numpy(),
+        steering=steering.cpu().numpy(),
+        seconds=time.perf_counter() - started,
+    )
+
+
+def join_policies(shares: Sequence[TrainedPolicies]) -> TrainedPolicies:
+    """Return policies that were trained in shares on the same data as if they had been trained at once.
+
+    `seconds` is the sum over the shares.
+    """
+    first = shares[0]
+    curves = pd.concat([share.curves for share in shares], ignore_index=True)
+    ranks = {name: curves[name].map({each: rank for rank, each in enumerate(order)}) for name, order in ORDER.items()}
+    order = np.lexsort((ranks["metric"], ranks["split"], curves["epoch"]))  # stable: seeds stay in order
+    return TrainedPolicies(
+        weights={
+            name: value if name.startswith("z_") else np.concatenate([share.weights[name] for share in shares])
+            for name, value in first.weights.items()
+        },
+        curves=curves.iloc[order].reset_index(drop=True),
+        acceleration=np.concatenate([share.acceleration for share in shares]),
+        steering=np.concatenate([share.steering for share in shares]),
+        seconds=sum(share.seconds for share in shares),
+    )
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _check(
+    z_train: NDArray[Any],
+    z_test: NDArray[Any],
+    labels_train: pd.DataFrame,
+    labels_test: pd.DataFrame,
+    seeds: Sequence[int],
+    settings: PolicySettings,
+) -> None:
+    if not seeds or len(set(seeds)) != len(seeds):
+        raise BadInputError(f"policy seeds {list(seeds)}: at least one is needed, and each once")
+    for split, z, labels in (("train", z_train, labels_train), ("test", z_test, labels_test)):
+        if z.ndim != 2 or z.shape[1] != LATENT or not len(z) or z.dtype != np.float32:
+            raise BadInputError(f"{split} latents are {z.dtype} {list(z.shape)}; float32 [frames, {LATENT}] is needed")
+        if not np.isfinite(z).all():
+            raise BadInputError(f"{split} latents hold values that are not finite; train the encoder again")
+        for column in ("steering", "acceleration"):
+            values = np.asarray(labels[column])
+            if values.shape != (len(z),) or not np.isfinite(values).all():
+                raise BadInputError(f"{split} labels '{column}' must be {len(z)} finite numbers, one for each latent")
+        if not np.isin(labels["acceleration"], range(len(ACCELERATIONS))).all():
+            raise BadInputError(f"{split} labels 'acceleration' must be classes 0 to {len(ACCELERATIONS) - 1}")
+    if settings.batch > len(z_train):
+        raise BadInputError(
+            f"policy.batch is {settings.batch}, more than the {len(z_train)} policy train frames; "
+            f"set --policy.batch to at most that"
+        )
+
+
+def _policy_data(scaling: Arrays, train: Labelled, test: Labelled, device: torch.device) -> PolicyData:
+    (x_train, y_train), (x_test, y_test) = (
+        (
+            torch.from_numpy(normalise(scaling, z)).to(device),
+            Labels(
+                torch.from_numpy(np.array(labels["steering"], np.float32)).to(device),
+                torch.from_numpy(np.array(labels["acceleration"], np.int64)).to(device),
+            ),
+        )
+        for z, labels in (train, test)
+    )
+    some = np.random.default_rng(SUBSET).permutation(len(x_train))[: len(x_test)]
+    part = torch.from_numpy(np.sort(some)).to(device)
+    seen = (x_train[part], Labels(*(values[part] for values in y_train)))
+    return PolicyData(x_train, y_train, {"train": seen, "test": (x_test, y_test)})
+
+
+def _points(seeds: Sequence[int], epoch: int, values: dict[str, NDArray[Any]]) -> pd.DataFrame:
+    """Rows of the tidy table for one epoch."""
+    index = pd.MultiIndex.from_product([values, METRICS, seeds], names=["split", "metric", "policy_seed"])
+    numbers = np.concatenate([metrics.reshape(-1) for metrics in values.values()])
+    return (
+        pd.DataFrame({"value": numbers.astype(np.float64)}, index=index)
+        .reset_index()
+        .assign(stage="policy", epoch=epoch)
+    )
+
+
+def _fit(ensemble: PolicyEnsemble, settings: PolicySettings, steps: int, device: str) -> None:
+    with trainer(
+        torch.device(device),
+        settings.epochs,
+        f"{len(ensemble.seeds)} policies at batch {settings.batch}",
+        "lower --policy.batch or --policy_seeds, or end what else runs there",
+    ) as lightning_trainer:
+        lightning_trainer.fit(ensemble, train_dataloaders=range(steps))
+
+
+ORDER = {"split": SPLITS, "metric": METRICS}  # of the rows of an epoch's curves

@@ -1,0 +1,299 @@
+"""The model of a report: `Report` holds every number that a report prints, and its fields are those of report.json.
+
+A report.json may be anybody's, so it is checked on reading.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from study.analysis import confounds, learning_curves
+from study.analysis.claims import Verdict
+from study.analysis.effects import Contrast, Interval
+from study.analysis.intervals import Estimate
+from study.analysis.learning_curves import Point
+from study.config.files import validated
+from study.config.settings import Number, Settings
+from study.errors import BadInputError
+
+FORMAT_VERSION = 1
+
+
+class Part(Settings, extra="ignore"):
+    """A part of a report.json; what another version adds to it is ignored."""
+
+
+class Failure(Part):
+    """A failed cell with the last line of its error."""
+
+    cell: str
+    reason: str
+
+
+class Sweep(Part):
+    """Which sweep it is, and how much of it is finished."""
+
+    name: str
+    title: str
+    simulator: str
+    imported: bool = False
+    profile: str
+    design: Literal["A", "B"]
+    encoder_seeds: int
+    policy_seeds: int
+    policy_epochs: int
+    baseline: str
+    heads: tuple[str, ...]
+    fractions: tuple[float, ...]
+    planned: int
+    finished: int
+    unfinished: tuple[str, ...]
+    failed: tuple[Failure, ...]
+
+
+class Spread(Part):
+    """A final score over seeds; `units` has the value of each sampling unit by its seed."""
+
+    mean: float
+    sd: Number
+    iqm: Number
+    low: Number
+    high: Number
+    n: int
+    kind: str
+    units: dict[int, float]
+
+
+class Score(Part):
+    """Final scores of a cell; `share` is the gain's part of the possible gain, where there is a ceiling."""
+
+    cell: str
+    heads: str
+    fraction: float
+    encoders: int
+    n: int
+    accuracy: Spread
+    steering: Spread
+    balanced: Spread | None = None
+    gain: Number
+    share: Number = math.nan
+    macro_f1: Number
+    confusion: tuple[tuple[Number, ...], ...]
+    classes: tuple[float, ...]
+
+
+class Convergence(Part):
+    """How fast a cell reaches the baseline's final accuracy."""
+
+    cell: str
+    fraction: float
+    heads: str
+    target: float
+    mean_curve: Interval
+    median: Number
+    share: float
+    area: float
+    n: int
+
+
+class Confound(Part):
+    """A setting under both of its values; without contrasts where no sweep varies it."""
+
+    setting: str
+    about: str
+    here: str
+    there: str | None
+    sweep: str
+    floor: Number
+    contrasts: tuple[confounds.Contrast, ...]
+
+    @property
+    def flipped(self) -> list[str]:
+        """Return the names of the contrasts whose sign differs between the two values."""
+        return [row.name for row in self.contrasts if row.here.value * row.there.value < 0]
+
+
+class Components(Part):
+    """Standard deviations of accuracy between encoders, between policies and between epochs."""
+
+    cell: str
+    encoder: Number
+    policy: Number
+    epoch: Number
+
+
+class EncoderLosses(Part):
+    """Losses of an encoder's heads on each split after the last epoch, mean over encoder seeds."""
+
+    cell: str
+    encoders: int
+    losses: dict[str, dict[str, Number]]
+
+
+class Probe(Part):
+    """Share of each quantity's variance that a linear model reads off the latents, mean over encoders."""
+
+    cell: str
+    encoders: int
+    speed: Number
+    stop: Number
+    gap: Number
+    steering: Number
+    brake: Number
+
+
+class Setting(Part):
+    """A setting with its value as text, its meaning, and whether the value is the program's default."""
+
+    group: str
+    name: str
+    value: str
+    meaning: str
+    default: bool
+
+
+class Data(Part):
+    """Frames, drives and labels of each set before and after balancing, as the frame store's manifest has them."""
+
+    key: str | None
+    sets: dict[str, dict[str, Any]]
+
+
+class CellCost(Part):
+    """Wall time [s] and memory [bytes] of a cell, and where it ran."""
+
+    cell: str
+    encoder: Number
+    encode: Number
+    policies: Number
+    whole: Number
+    peak_bytes: int | None
+    device: str | None
+    precision: str | None
+    threads: int | None
+    frames: int | None
+
+
+class Cost(Part):
+    """Costs of the finished cells, and the estimated disk space of the sweep [bytes]."""
+
+    cells: tuple[CellCost, ...]
+    seconds: float
+    disk: int
+    peak_bytes: int | None
+
+
+class Provenance(Part):
+    """Where the numbers come from; `cell_commits` has several entries where cells come from different commits."""
+
+    commit: str | None
+    dirty: bool | None
+    lock: str | None
+    python: str | None
+    platform: str | None
+    cpu: str | None
+    cores: int | None
+    diff_lines: int
+    packages: dict[str, str]
+    cell_commits: tuple[str, ...]
+    command: str
+    keys: dict[str, str]
+
+
+class FigureText(Part):
+    """A figure's file name, its place in the report, its caption, and what it shows in words."""
+
+    name: str
+    place: str
+    caption: str
+    alt: str
+
+
+class Report(Part):
+    """Every number of a sweep's report: NaN where there is none, infinite for an epoch that is never reached."""
+
+    format_version: int = FORMAT_VERSION
+    sweep: Sweep
+    floor: dict[str, Number]
+    ceiling: Spread | None = None
+    scores: tuple[Score, ...]
+    comparisons: tuple[Contrast, ...]
+    planned_contrasts: int
+    convergence: tuple[Convergence, ...]
+    confounds: tuple[Confound, ...] = ()
+    components: tuple[Components, ...]
+    encoders: tuple[EncoderLosses, ...]
+    probes: tuple[Probe, ...] = ()
+    claims: tuple[Verdict, ...]
+    rules: dict[str, float]
+    settings: tuple[Setting, ...]
+    parameters: dict[str, int]
+    data: Data
+    cost: Cost
+    provenance: Provenance
+    outcomes: dict[str, tuple[str, ...]]
+    figures: tuple[FigureText, ...] = ()
+
+    @property
+    def points(self) -> list[Point]:
+        """Return the head sets and fractions that have a score."""
+        return [(row.heads, row.fraction) for row in self.scores]
+
+    @property
+    def accuracy_contrasts(self) -> list[Contrast]:
+        """Return the contrasts in acceleration accuracy."""
+        return [row for row in self.comparisons if row.metric == learning_curves.ACCURACY]
+
+    def above_baseline(self, point: Point) -> Estimate | None:
+        """Return the difference in accuracy of a head set to the baseline at the same fraction."""
+        base = (self.sweep.baseline, point[1])
+        for row in self.accuracy_contrasts:
+            if point != base and {row.first, row.second} == {point, base}:
+                own: Estimate = row.difference
+                turned = dataclasses.replace(own, value=-own.value, low=-own.high, high=-own.low)
+                return own if row.first == point else turned
+        return None
+
+    def json(self) -> bytes:  # type: ignore[override] # pydantic's own is deprecated
+        """Return the content of report.json: NaN is null, and infinity "never"."""
+        return json.dumps(_plain(self.model_dump()), indent=1, ensure_ascii=False, allow_nan=False).encode()
+
+
+def _plain(value: Any) -> Any:
+    """Return a value with every number as JSON has it."""
+    if isinstance(value, Mapping):
+        return {str(name): _plain(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None if math.isnan(value) else "never"
+    return value
+
+
+def checked(content: object, source: str) -> Report:
+    """Return the report in a report.json's content. Raises BadInputError naming the source and what is wrong."""
+    if not isinstance(content, dict) or "format_version" not in content:
+        raise BadInputError(f"{source} is no report of this program (no format_version); give one that it wrote")
+    if content["format_version"] != FORMAT_VERSION:
+        raise BadInputError(
+            f"{source} has report format {content['format_version']}, this program reads {FORMAT_VERSION}; "
+            "write it again with: python -m study.report NAME"
+        )
+    return validated(Report, content, f"{source} is not a complete report; run python -m study.report NAME again")
+
+
+def read_report(path: Path) -> Report:
+    """Return the report in a report.json, or in the folder that holds one. Raises BadInputError when it is none."""
+    file = path / "report.json" if path.is_dir() else path
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise BadInputError(f"cannot read {file}: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
+        raise BadInputError(f"{file} is no JSON: {error}; write it again with python -m study.report NAME") from error
+    return checked(content, str(file))

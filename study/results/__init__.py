@@ -1,0 +1,1 @@
+"""Results of cells and sweeps, as tables and files."""

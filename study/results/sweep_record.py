@@ -1,0 +1,65 @@
+"""A sweep as reports read it: its plan and the results of its cells."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import pandas as pd
+
+from study.config.grid import Cell, Grid
+from study.config.heads import CEILING
+from study.config.settings import StudySettings
+from study.results.cell_result import TABLE_COLUMNS, CellResult
+
+
+@dataclass(frozen=True)
+class SweepRecord:
+    """A sweep as the tracker knows it: what was planned, what is finished, what failed (key -> reason).
+
+    `provenance`: commit, uncommitted diff, versions, machine; `data`: the frame store's manifest; `variants`: sweeps
+    that differ in one setting only, by its name.
+    """
+
+    grid: Grid
+    profile: str
+    settings: StudySettings
+    planned: dict[str, Cell]
+    results: dict[str, CellResult]
+    failed: dict[str, str] = field(default_factory=dict)
+    provenance: dict[str, Any] = field(default_factory=dict)
+    data: dict[str, Any] = field(default_factory=dict)
+    variants: dict[str, SweepRecord] = field(default_factory=dict)
+
+    @property
+    def complete(self) -> bool:
+        """Whether every planned cell is finished."""
+        return set(self.planned) <= set(self.results)
+
+    @property
+    def ceiling(self) -> CellResult | None:
+        """What policies reach that are given the true state, where that cell is finished."""
+        key = next((key for key, cell in self.planned.items() if cell.heads == CEILING), "")
+        return self.results.get(key)
+
+    def table(self, *, ceiling: bool = False) -> pd.DataFrame:
+        """Return the tidy table: one row per measured point, columns TABLE_COLUMNS, in the order of the plan.
+
+        The ceiling is no head set under study: it is in the table only when asked for.
+        """
+        tidy = self._tidy
+        return tidy if ceiling else tidy[tidy["heads"] != CEILING].reset_index(drop=True)
+
+    @cached_property
+    def _tidy(self) -> pd.DataFrame:
+        parts = [
+            self.results[key].curves.assign(
+                sweep=self.grid.name, heads=cell.heads, fraction=cell.fraction, encoder_seed=cell.encoder_seed
+            )
+            for key, cell in self.planned.items()
+            if key in self.results
+        ]
+        if not parts:
+            return pd.DataFrame(columns=list(TABLE_COLUMNS))
+        return pd.concat(parts, ignore_index=True)[list(TABLE_COLUMNS)]

@@ -1,0 +1,169 @@
+"""Train the cells of a plan on an engine, and commit what they give: the one writer to MLflow and Optuna."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+from study.compute.provenance import cores, provenance
+from study.config.workspace import DATA
+from study.console.display import Display
+from study.data.card import card_files, source_drives
+from study.data.frames import open_frames
+from study.data.prepare import data_flow, describe_data
+from study.engine.flows import run_flow, run_flows
+from study.engine.inline import InlineEngine
+from study.engine.local import local_engine, visible_gpus
+from study.engine.remote import cluster_engine
+from study.engine.tasks import Engine
+from study.engine.workers import DaskEngine
+from study.errors import EXIT_FAILED, BadInputError, masked
+from study.stages import DESCRIBE, Batch, Flow, Task, cell_cost
+from study.sweep.committing import Committing, store_folder
+from study.sweep.plan import Plan
+from study.tracking.tracker import Tracker
+
+
+def run_cells(plan: Plan, options: argparse.Namespace, tracker: Tracker) -> dict[str, str]:
+    """Train what is not finished, until every cell is finished or has failed. Returns the failed, with reasons."""
+    done = tracker.finished(list(plan.cells))
+    given_up = {} if options.retry_failed else tracker.given_up(set(plan.cells) - set(done))
+    waiting = [key for key in plan.cells if key not in done and key not in given_up]
+    costs = {key: cell_cost(plan.settings, plan.cells[key], plan.grid.policy_seeds).seconds for key in waiting}
+    labels = {key: cell.label for key, cell in plan.cells.items()}
+    ready = (plan.frames / "manifest.json").is_file()
+    title = f"{plan.grid.name} ({plan.profile})"
+    order = sorted(waiting, key=lambda key: -costs[key])
+    with (
+        Display(
+            title,
+            costs | dict.fromkeys(given_up, 0.0),
+            labels,
+            0.0 if ready or not waiting else plan.data_cost.seconds,
+            plan.works,
+        ) as display,
+        temporary_folder(DATA),
+        start_engine(options) if waiting else InlineEngine() as engine,
+    ):
+        if waiting:
+            data, card = run_flow(_data_flow(plan, engine), engine, display.data)
+        else:
+            data, card = _describe_here(plan) if ready else ({}, {})
+        if plan.imported:
+            data["writers"] = plan.imported.writers  # a report must not call these drives our town's
+        origin = provenance() | {"command": plan.command}
+        sweep_run = tracker.open_sweep(plan.grid, plan.profile, plan.settings, plan.cells, data, origin)
+        with Committing(plan, options, tracker, sweep_run, order, display, engine.gpus() > 0) as cells:
+            with tempfile.TemporaryDirectory() as name:
+                files = [Path(name) / file for file in card]
+                for file in files:
+                    file.write_bytes(card[file.name])
+                tracker.log_files(sweep_run, files, "data")
+            for key in given_up:
+                display.fail(key)
+            run_flows(engine, cells.next_flow, cells.listener())
+            return given_up | cells.close()
+
+
+def report_failed(plan: Plan, failed: Mapping[str, str], command: str) -> int:
+    """Print the failed cells with their reasons and what can be done; returns the exit code."""
+    for key, reason in failed.items():
+        print(f"failed: {plan.cells[key].label} ({key}): {reason.strip()}", file=sys.stderr)
+    if failed:
+        print(f"Once the cause is gone: {command.removesuffix(' --retry-failed')} --retry-failed", file=sys.stderr)
+    return EXIT_FAILED if failed else 0
+
+
+def start_engine(options: argparse.Namespace) -> DaskEngine | InlineEngine:
+    """Start the engine that the options ask for."""
+    if options.cluster:
+        return cluster_engine(options.cluster, options.certificates)
+    workers = options.workers or max(1, cores() // options.threads)
+    return local_engine(workers, DATA / "tmp", visible_gpus(options.device))
+
+
+@contextmanager
+def temporary_folder(root: Path) -> Iterator[None]:
+    """Have this process put its temporary files below `root`, where what a kill leaves is removed by the next sweep."""
+    folder = root / "tmp"
+    folder.mkdir(parents=True, exist_ok=True)
+    before = tempfile.tempdir
+    lock = FileLock(root / ".in-use")
+    with suppress(Timeout):  # another sweep works here, and may need what it has there
+        lock.acquire(blocking=False)
+        _empty(folder)
+    tempfile.tempdir = str(folder.absolute())
+    try:
+        yield
+    finally:
+        tempfile.tempdir = before
+    if lock.is_locked:
+        _empty(folder)
+        lock.release()
+
+
+def _empty(folder: Path) -> None:
+    for path in folder.iterdir():
+        shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
+
+
+def _data_flow(plan: Plan, engine: Engine) -> Flow[Any]:
+    """Make and describe the frames: here, with the engine's help, unless its workers have folders of their own."""
+    if _shares_folder(engine):
+        yield from data_flow(plan.settings, DATA, plan.imported)
+    task = Task(DESCRIBE, describe_data, (plan.frames, plan.drives, plan.settings, plan.imported))
+    (described,) = yield Batch([task])
+    return described
+
+
+def _shares_folder(engine: Engine) -> bool:
+    if not isinstance(engine, DaskEngine):
+        return True
+    with tempfile.NamedTemporaryFile(dir=DATA, prefix=".shared-") as token:
+        return engine.workers_see(DATA / Path(token.name).name)
+
+
+def _describe_here(plan: Plan) -> tuple[dict[str, Any], dict[str, bytes]]:
+    store = open_frames(plan.frames)
+    files = card_files(store, source_drives(store, plan.drives), plan.frames)
+    return store.manifest, {path.name: path.read_bytes() for path in files}
+
+
+@contextmanager
+def hold_store(tracking: str, sweep: str, *, wait: bool) -> Iterator[None]:
+    """Hold a tracking store for one sweep at a time.
+
+    Raises BadInputError that says who holds it, unless told to `wait`.
+    """
+    folder = store_folder(tracking)
+    folder.mkdir(parents=True, exist_ok=True)
+    lock, holder = FileLock(folder / "sweep.lock"), folder / "sweep.json"
+    try:
+        lock.acquire(blocking=False)
+    except Timeout:
+        who = "another sweep"
+        with suppress(OSError, ValueError, KeyError):  # it has not written its name yet
+            other = json.loads(holder.read_text(encoding="utf-8"))
+            who = f"another sweep, {other['sweep']} (process {other['process']}),"
+        if not wait:
+            raise BadInputError(
+                f"{who} runs on this store ({masked(tracking)}); wait for it, or give --wait to start when it ends"
+            ) from None
+        print(f"waiting for {who}, which runs on this store", file=sys.stderr)
+        lock.acquire()
+    try:
+        holder.write_text(json.dumps({"sweep": sweep, "process": os.getpid()}), encoding="utf-8")
+        yield
+    finally:
+        holder.unlink(missing_ok=True)
+        lock.release()

@@ -1,0 +1,210 @@
+"""How far a sweep is, asked from any terminal while it runs: what is finished, what runs where, what is left.
+
+MLflow is asked, not Optuna: a cell's attempts say who runs them and have signs of life.
+
+python -m study.sweep status heads
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import os
+import platform
+import time
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+from study.console.display import show_table
+from study.console.options import Parser, add_tracking_option
+from study.errors import masked
+from study.stages import CELL_STAGES, RESULT_S, STAGES, Work, cell_cost, clock, share_done
+from study.sweep.options import add_plan_options
+from study.sweep.plan import Plan, given_plan, look_up
+
+if TYPE_CHECKING:
+    from study.tracking.cell_run import Attempt
+
+
+State = Literal["finished", "running", "silent", "dead", "waiting", "failed"]
+STATES: dict[State, str] = {  # with its style on a terminal
+    "finished": "green",
+    "running": "bold",
+    "silent": "yellow",
+    "dead": "red",
+    "waiting": "dim",
+    "failed": "red",
+}
+SILENT = 120.0  # [s] without a sign of life: several times what loading torch or a commit takes on a busy machine
+
+
+@dataclass(frozen=True)
+class CellStatus:
+    """Where a cell stands. Times in s: `since` 1970, `took` by the finished attempt, `quiet` without a sign of life.
+
+    `silent`: it says RUNNING and nothing has been heard for two minutes; `dead`: its process on this host is gone.
+    Both wait for a sweep to take them up again. `share`: of the cell's work that is done.
+    """
+
+    key: str
+    label: str
+    state: State
+    attempt: int = 0
+    host: str = ""
+    process: str = ""
+    device: str = ""
+    since: float | None = None
+    quiet: float = 0.0
+    stage: str = ""
+    epoch: int = 0
+    epochs: int = 0
+    share: float = 0.0
+    took: float | None = None
+    reason: str = ""
+
+
+def cell_statuses(plan: Plan, attempts: Mapping[str, Sequence[Attempt]], now: float, host: str) -> list[CellStatus]:
+    """Where each cell of a plan stands at a time [s since 1970], seen from a host."""
+    return [_cell_status(plan, key, attempts.get(key, ()), now, host) for key in plan.cells]
+
+
+def _cell_status(plan: Plan, key: str, attempts: Sequence[Attempt], now: float, host: str) -> CellStatus:
+    found = CellStatus(key, plan.cells[key].label, "waiting", len(attempts))
+    done = next((attempt for attempt in attempts if attempt.status == "FINISHED"), None)
+    if done is not None:
+        return dataclasses.replace(found, state="finished", share=1.0, took=done.metrics.get("seconds/cell"))
+    if not attempts:
+        return found
+    last = attempts[-1]
+    if last.status == "FAILED":
+        return dataclasses.replace(found, state="failed", reason=_first(last.tags.get("reason", "unknown")))
+    if last.status != "RUNNING":
+        return found
+    tags = last.tags
+    quiet = max(0.0, now - float(tags.get("alive", last.started)) / 1000)
+    state: State = "silent" if quiet > SILENT else "running"
+    if tags.get("host") == host and not _runs(tags.get("process", "")):
+        state = "dead"
+    stage, _, steps = tags.get("progress", "").partition(" ")
+    part, whole = (int(number) for number in steps.split("/")) if steps else (0, 1)
+    epochs = {"encoder": plan.settings.encoder.epochs, "policy": plan.settings.policy.epochs}.get(stage, 0)
+    work = Work(plan.settings, plan.cells[key], plan.grid.policy_seeds)
+    return dataclasses.replace(
+        found,
+        state=state,
+        host=tags.get("host", ""),
+        process=tags.get("process", ""),
+        device=tags.get("device", ""),
+        since=last.started / 1000,
+        quiet=quiet,
+        stage=stage,
+        epoch=math.ceil(part * epochs / whole),
+        epochs=epochs,
+        share=share_done(CELL_STAGES, work, STAGES[stage], part / whole) if stage in STAGES else 0.0,
+    )
+
+
+def _first(reason: str) -> str:
+    """The line of a reason that says most: of a traceback the last."""
+    lines = reason.strip().splitlines() or ["unknown"]
+    return lines[-1] if lines[0].startswith("Traceback") else lines[0]
+
+
+def _runs(process: str) -> bool:
+    try:
+        os.kill(int(process), 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, ValueError, OverflowError):  # another user's, or nobody has said which
+        return True
+    return True
+
+
+def seconds_left(plan: Plan, cells: Sequence[CellStatus], now: float, *, frames_ready: bool) -> float:
+    """Estimate of what is left: expected costs, times what the cells so far have shown them to be wrong by.
+
+    Failed cells are not counted, since nobody takes them up by themselves.
+    """
+    costs = {key: cell_cost(plan.settings, cell, plan.grid.policy_seeds).seconds for key, cell in plan.cells.items()}
+    expected = measured = left = 0.0
+    for cell in cells:
+        if cell.took is not None:
+            expected, measured = expected + costs[cell.key], measured + cell.took
+        if cell.state == "running" and cell.since is not None and cell.share > 0:
+            begun = RESULT_S + (costs[cell.key] - RESULT_S) * cell.share
+            expected, measured = expected + begun, measured + now - cell.since
+        if cell.state not in ("finished", "failed"):
+            left += costs[cell.key] * (1 - (cell.share if cell.state == "running" else 0.0))
+    at_a_time = max(1, sum(cell.state == "running" for cell in cells))
+    data = plan.data_cost.seconds if left and not frames_ready else 0.0
+    return data + left / at_a_time * (measured / expected if expected else 1.0)
+
+
+# --- the command ----------------------------------------------------------------------------------------------------
+
+
+def main(args: Sequence[str]) -> int:
+    """Run the command and return its exit code."""
+    made = Parser(
+        prog="study.sweep status",
+        usage="python -m study.sweep status NAME [--profile P] [--tracking URI] [--json] [--group.setting VALUE ...]",
+        description="What of a sweep is finished, what runs where, what is left. Settings must be those of the sweep.",
+    )
+    add_plan_options(made)
+    add_tracking_option(made)
+    made.add_argument("--json", action="store_true", help="one JSON object on stdout")
+    options = made.parse(args)
+    plan = given_plan(options)
+    tracker = look_up(options.tracking)
+    attempts = tracker.attempts(plan.cells) if tracker else {}
+    now = time.time()
+    cells = cell_statuses(plan, attempts, now, platform.node())
+    ready = (plan.frames / "manifest.json").is_file()
+    left = seconds_left(plan, cells, now, frames_ready=ready)
+    if options.json:
+        facts = {
+            "sweep": plan.grid.name,
+            "profile": plan.profile,
+            "tracking": masked(options.tracking),
+            "cells": [dataclasses.asdict(cell) for cell in cells],
+            "seconds_left": round(left, 1),
+        }
+        print(json.dumps(facts))
+    else:
+        _show(plan, cells, left, now, frames_ready=ready)
+    return 0
+
+
+def _show(plan: Plan, cells: Sequence[CellStatus], left: float, now: float, *, frames_ready: bool) -> None:
+    counts = Counter(cell.state for cell in cells)
+    parts = [f"{counts[state]} {state}" for state in STATES if state != "finished" and counts[state]]
+    parts = [f"{plan.grid.name} ({plan.profile}): {counts['finished']} of {len(cells)} cells finished", *parts]
+    if left:
+        parts.append(f"about {clock(left)} left")
+    print(", ".join(parts))
+    if not frames_ready and counts["finished"] < len(cells):
+        print("frames are not made yet")
+    show_table([_row(cell, now) for cell in cells], [STATES[cell.state] for cell in cells])
+
+
+def _row(cell: CellStatus, now: float) -> tuple[str, str, str, str, str]:
+    """Label, state, how far, since when, where."""
+    how, since, where = "", "", ""
+    if cell.state == "finished" and cell.took is not None:
+        how = f"in {clock(cell.took)}"
+    elif cell.state == "failed":
+        how = cell.reason
+    elif cell.since is not None:
+        how = STAGES[cell.stage].activity if cell.stage in STAGES else "starting"
+        how += f", epoch {cell.epoch} of {cell.epochs}" if cell.epochs else ""
+        if cell.state != "running":
+            how += f"; no sign of life for {clock(cell.quiet)}"
+        since = f"since {time.strftime('%H:%M', time.localtime(cell.since))} ({clock(now - cell.since)})"
+        where = f"{cell.host}, process {cell.process}" if cell.host else ""
+        where += f", {cell.device}" if cell.device else ""
+    elif cell.attempt:
+        how = f"{cell.reason or 'stopped'}; tried {cell.attempt} time{'s' if cell.attempt > 1 else ''}"
+    return cell.label, cell.state, how, since, where
