@@ -78,7 +78,7 @@ def test_dry_run_speaks_json(folder):
 @pytest.mark.parametrize("words", [["--help"], ["heads", "--dry-run"]])
 def test_help_and_dry_run_load_nothing_heavy(folder, words):
     code = (
-        "import sys; from study.sweep import main\n"
+        "import sys; from study.sweep.__main__ import main\n"
         f"try: main({words!r})\n"
         "except SystemExit: pass\n"
         f"print([name for name in {HEAVY!r} if name in sys.modules], file=sys.stderr)"

@@ -87,7 +87,7 @@ def test_a_damaged_store_is_told_and_made_again(settings, root, tmp_path, capsys
 
 
 def test_a_full_disk_is_told_before_anything_is_made(settings, tmp_path, monkeypatch):
-    monkeypatch.setattr("study.data.shutil.disk_usage", lambda _: SimpleNamespace(free=1000))
+    monkeypatch.setattr("study.data.prepare.shutil.disk_usage", lambda _: SimpleNamespace(free=1000))
     with pytest.raises(BadInputError, match="free"):
         run_flow(data_flow(settings, tmp_path))
     assert list(tmp_path.iterdir()) == []
@@ -96,7 +96,7 @@ def test_a_full_disk_is_told_before_anything_is_made(settings, tmp_path, monkeyp
 def test_room_that_a_killed_build_has_taken_is_not_asked_for_again(settings, root, tmp_path, monkeypatch):
     shutil.copytree(root / "episodes", tmp_path / "episodes")
     free = data_cost(settings).bytes - 10_000
-    monkeypatch.setattr("study.data.shutil.disk_usage", lambda _: SimpleNamespace(free=free))
+    monkeypatch.setattr("study.data.prepare.shutil.disk_usage", lambda _: SimpleNamespace(free=free))
     assert (run_flow(data_flow(settings, tmp_path)) / "manifest.json").is_file()
 
 

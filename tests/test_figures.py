@@ -118,8 +118,8 @@ def test_a_figure_is_written_whole_in_the_format_of_its_ending(tmp_path):
 
 
 def test_picture_rows_place_a_picture_of_each_row_in_each_column():
-    pictures = np.arange(3, dtype=np.uint8)[:, None, None] * np.ones((3, 64, 64), np.uint8)
-    figure = pictures.picture_rows([("input", pictures), ("", pictures), ("target", pictures)])
+    shades = np.arange(3, dtype=np.uint8)[:, None, None] * np.ones((3, 64, 64), np.uint8)
+    figure = pictures.picture_rows([("input", shades), ("", shades), ("target", shades)])
     assert [axes.images[0].get_array().shape[:2] for axes in figure.axes] == [(200, 600)] * 2
     assert [text.get_text() for text in figure.texts] == ["input", "target"]
 

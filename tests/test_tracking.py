@@ -628,7 +628,7 @@ def test_credentials_are_hidden():
 
 
 def test_a_normal_use_prints_nothing(uri):
-    code = f"from study.tracking import Tracker; print(Tracker({uri!r}).finished(['x']), end='')"
+    code = f"from study.tracking.tracker import Tracker; print(Tracker({uri!r}).finished(['x']), end='')"
     root = Path(__file__).parent.parent
     done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True)
     assert (done.stdout, done.stderr) == ("{}", "")

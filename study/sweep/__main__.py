@@ -36,7 +36,8 @@ def parser() -> Parser:
         prog="study.sweep",
         usage="python -m study.sweep NAME [--profile P] [--dry-run] [--group.setting VALUE ...]\n"
         "       python -m study.sweep status NAME ...    what is done, what runs where, what is left\n"
-        "       python -m study.sweep verify NAME ...    compute a finished cell again and compare",
+        "       python -m study.sweep verify NAME ...    compute a finished cell again and compare\n"
+        "       python -m study.sweep train NAME ...     train where there is no tracker; results become folders",
         description="Run a sweep to its report. Finished cells never run again; a killed sweep goes on.",
         epilog="In brackets: the value where the profile names no other.\n"
         "Example: python -m study.sweep heads --profile smoke --heads '[rec,full]' --encoder.epochs 50",
@@ -62,6 +63,10 @@ def main(args: Sequence[str]) -> int:
         from study.sweep.status import main as status  # noqa: PLC0415
 
         return status(args[1:])
+    if args[:1] == ["train"]:
+        from study.sweep.train import main as train  # noqa: PLC0415
+
+        return train(args[1:])
     if args[:1] == ["verify"]:
         from study.sweep.verify import main as verify  # noqa: PLC0415
 

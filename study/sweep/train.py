@@ -27,7 +27,7 @@ from study.compute.provenance import cores
 from study.config.workspace import DATA
 from study.console.display import Display
 from study.console.interrupts import stoppable
-from study.console.options import Parser, run, typed
+from study.console.options import Parser, typed
 from study.data.prepare import data_flow
 from study.engine.flows import Listener, run_flow, run_flows
 from study.engine.inline import InlineEngine
@@ -170,7 +170,3 @@ class _Saving:
         self.reasons[name] = failure.reason
         self._display.fail(name)
         self._locks.pop(name).release()
-
-
-if __name__ == "__main__":
-    run(main)
