@@ -9,7 +9,7 @@ from study.analysis import intervals, learning_curves
 from study.config.grid import Grid
 from study.config.heads import HEAD_SETS
 from study.errors import BadInputError
-from study.figures import curves, differences, style
+from study.figures import curves, differences, pictures, style
 from study.report.drawings import draw, draw_sweeps
 from study.report.summary import summarise
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from study.atomic import atomic_folder
 from study.config.paper import ACCELERATIONS, IMAGE
 from study.config.settings import BirdviewSettings
 from study.data.birdview import Renderer, governing_light
@@ -23,7 +24,6 @@ from study.episode.schema import GREEN, Episode
 from study.errors import BadInputError
 from study.figures.pictures import contact_sheet
 from study.figures.style import write
-from study.products import atomic_folder
 
 FILES = ("contact.png", "drive.gif")
 SHOWN = 12  # frames of each set on the contact sheet

@@ -12,10 +12,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from study.atomic import atomic_folder
 from study.episode.checks import check_episode
 from study.episode.schema import RED, SCHEMA_VERSION, Agent, Episode, Lane, Light, empty_states
 from study.errors import BadInputError
-from study.products import atomic_folder
 
 FILES = ("map.json", "states.parquet", "lights.parquet", "routes.parquet")
 

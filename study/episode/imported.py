@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
+from study.atomic import atomic_folder
 from study.config.keys import content_key
 from study.config.settings import FramesSettings
 from study.errors import BadInputError
-from study.products import atomic_folder
 
 SCHEMA_VERSION = 1
 _ASSIGN = 4  # what a random generator is for; `selection` and `frames` have others

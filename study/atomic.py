@@ -1,0 +1,21 @@
+"""Folders that are written whole or not at all."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+@contextmanager
+def atomic_folder(folder: Path) -> Iterator[Path]:
+    """Yield an empty draft of `folder` to write into, which takes its place when the block ends without an error."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as name:
+        draft = Path(name) / folder.name
+        draft.mkdir()
+        yield draft
+        if folder.exists():
+            folder.rename(Path(name) / "old")
+        draft.rename(folder)
