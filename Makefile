@@ -27,9 +27,9 @@ test: $(VENV)/.installed ## lint, types and the tests
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
 	$(VENV)/bin/lint-imports --no-logo
-	$(RUN) -m pytest -m "not stress" $(ARGS)
+	$(RUN) -m pytest -m "not stress" -n 2 --dist loadscope --no-loadscope-reorder $(ARGS)
 
-stress: $(VENV)/.installed ## the long fault tests: kills, clusters
+stress: $(VENV)/.installed ## the long tests: kills, clusters, a browser, other machines
 	$(RUN) -m pytest -m stress $(ARGS)
 
 format: $(VENV)/.installed ## put the code into its one form

@@ -1,20 +1,91 @@
-"""What all tests need."""
+"""Gives every test a user, a working folder and the fixtures that several modules share."""
+
+from __future__ import annotations
 
 import os
 import shutil
 import signal
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
-pytest_plugins = ("servers", "stores", "running")
+import pytest
 
-# Tests send SIGINT to themselves and to programs that they start. A shell that runs the suite in the background has it
-# ignored, and every child would inherit that.
+ROOT = Path(__file__).parent.parent
+MEMORY = Path("/dev/shm")  # noqa: S108 - pytest makes a folder of the user's own there
+ROOM = 6 << 30  # bytes, of which about 2 GiB are used
+
+# Tests send SIGINT to themselves and to programs that they start. A shell that runs the suite in the background ignores
+# it, and every child would inherit that.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Databases wait for the disk at every commit, and these tests commit by the thousand: their folders lie in memory where
 # there is room. What a test must survive is a killed process, which needs no disk.
-MEMORY = Path("/dev/shm")  # noqa: S108 - pytest makes a folder of the user's own there
-ROOM = 6 << 30  # bytes, of which about 2 GiB are used
 if MEMORY.is_dir() and shutil.disk_usage(MEMORY).free >= ROOM:
     os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(MEMORY))
+
+# Nothing of the user is read or written: tests, and the programs that they start, have a home of their own. Matplotlib
+# and MLflow look for it as soon as they are loaded, so this cannot be a fixture.
+SANDBOX = Path(tempfile.mkdtemp(prefix="study-tests-", dir=os.environ.get("PYTEST_DEBUG_TEMPROOT")))
+for name in [name for name in os.environ if name.startswith(("XDG_", "MPL", "MLFLOW_", "GIT_"))]:
+    del os.environ[name]
+os.environ |= {"HOME": str(SANDBOX), "PYTHONPATH": str(ROOT)}
+
+# Tests that run side by side use one core each: threads that wait actively for each other take ten times as long.
+if "PYTEST_XDIST_WORKER" in os.environ:
+    os.environ["OMP_NUM_THREADS"] = "1"
+
+# After the environment is set: these modules load the study, and that loads matplotlib and MLflow.
+from study.config.settings import BirdviewSettings, FramesSettings  # noqa: E402
+from study.data.build import frames_flow  # noqa: E402
+from study.engine.flows import run_flow  # noqa: E402
+from study.tracking.store import SQLITE, open_store  # noqa: E402
+from tests.support.drives import write_drives  # noqa: E402
+from tests.support.sweeps import UndisturbedSweep  # noqa: E402
+
+
+def pytest_unconfigure() -> None:
+    """Remove the home."""
+    shutil.rmtree(SANDBOX, ignore_errors=True)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _working_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Run all tests in a working folder of their own; fails when one of them has left something there."""
+    folder, before = tmp_path_factory.mktemp("work"), Path.cwd()
+    shutil.copytree(ROOT / "sweeps", folder / "sweeps")
+    os.chdir(folder)
+    yield
+    os.chdir(before)
+    assert [path.name for path in folder.iterdir()] == ["sweeps"]
+
+
+@pytest.fixture(scope="session")
+def small_drives(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Return three drives for encoders, then three for policies."""
+    folder = tmp_path_factory.mktemp("drives")
+    return write_drives(folder / "a", 3) + write_drives(folder / "b", 3, first_seed=10)
+
+
+@pytest.fixture(scope="session")
+def small_store(small_drives: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of a frame store of those drives; cards and previews may be written there."""
+    folder = tmp_path_factory.mktemp("frames") / "store"
+    settings = FramesSettings(encoder=60, policy=40)
+    run_flow(frames_flow(settings, BirdviewSettings(), small_drives[:3], small_drives[3:], folder))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def empty_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a database file with MLflow's empty tables: making them takes seconds, copying the file nothing."""
+    path = tmp_path_factory.mktemp("empty") / "mlflow.db"
+    open_store(f"{SQLITE}{path}")
+    return path
+
+
+@pytest.fixture(scope="session")
+def undisturbed(empty_store: Path, tmp_path_factory: pytest.TempPathFactory) -> UndisturbedSweep:
+    """Return a finished sweep of four cells, to copy and to compare with."""
+    return UndisturbedSweep.run(tmp_path_factory.mktemp("undisturbed"), empty_store)

@@ -8,7 +8,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from drives import crossing_drive, write_drives
 from study.config.files import load_profile
 from study.config.settings import FramesSettings
 from study.data.birdview import valid_moments
@@ -22,6 +21,7 @@ from study.errors import BadInputError
 from study.sim import autopilot
 from study.sim.record import record_episode
 from study.sweep.plan import make_plan
+from tests.support.drives import crossing_drive, write_drives
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +31,7 @@ def drive():
 
 @pytest.fixture(scope="module")
 def town():
-    """A drive of our town, whose commands are known."""
+    """Return a drive of our town, whose commands are known."""
     settings = load_profile("smoke", {"town": {"vehicles": 30}, "recording": {"warm_up": 4, "duration": 8}})
     return record_episode(settings.town, settings.recording, 3)
 
@@ -48,7 +48,7 @@ def unlabelled(episode, **changes):
 
 
 def thinned(episode, every):
-    """The Episode at a lower rate: every so many-th step."""
+    """Return the Episode at a lower rate: every n-th step."""
     names = [field.name for field in dataclasses.fields(episode)]
     arrays = {name: getattr(episode, name) for name in names}
     part = {name: v[::every] for name, v in arrays.items() if isinstance(v, np.ndarray) and len(v) == episode.steps}

@@ -19,7 +19,6 @@ from safetensors.numpy import load_file, save_file
 from torch import nn
 from torch.nn import functional
 
-from drives import write_drives
 from study.compute import device
 from study.compute.device import choose_precision
 from study.config.heads import HEAD_SETS, HEADS
@@ -36,7 +35,8 @@ from study.encoder.networks import Decoder, Encoder
 from study.encoder.training import TrainedEncoder, train_encoder
 from study.engine.flows import run_flow
 from study.errors import BadInputError, TrainingDivergedError
-from waiting import questions
+from tests.support.drives import write_drives
+from tests.support.synchronisation import record_synchronisations
 
 FRAMES = FramesSettings(encoder=160, policy=40, spacing=0.3, balance="none")
 SETTINGS = EncoderSettings(epochs=2, batch=32, precision="fp32")
@@ -60,7 +60,7 @@ def frames(store: Path) -> Frames:
 
 @pytest.fixture(autouse=True)
 def one_thread() -> Any:
-    """Two threads wait actively for each other, which takes ten times as long when other tests run beside."""
+    """Use one thread: two wait actively for each other, which takes ten times as long beside other tests."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -275,9 +275,8 @@ def test_same_seed_same_bytes_whatever_the_global_generators(frames: Frames) -> 
 
 def test_bf16_follows_fp32_within_one_percent(frames: Frames) -> None:
     """Stated tolerance: each epoch's losses differ by less than 1 % of fp32's; latents come from fp32 in both."""
-    settings = SETTINGS.model_copy(update={"epochs": 4})
-    exact = train(frames, "full", settings)
-    fast = train(frames, "full", settings.model_copy(update={"precision": "bf16"}))
+    exact = train(frames, "full", fraction=0.5)
+    fast = train(frames, "full", SETTINGS.model_copy(update={"precision": "bf16"}), fraction=0.5)
     assert (exact.precision, fast.precision) == ("fp32", "bf16")
     train_rows = exact.curves["split"] == "train"
     gap = (fast.curves["value"] / exact.curves["value"] - 1).abs()
@@ -346,7 +345,7 @@ def test_data_on_a_device_and_data_copied_ahead_give_the_batches_of_the_mapped_f
 
 
 def both_ways(frames: Frames, heads: str, beta: float) -> Iterator[tuple[MultiHeadAutoencoder, torch.Tensor]]:
-    """An autoencoder with the gradients and losses of one batch: head by head, and after `fuse`."""
+    """Yield an autoencoder with the gradients and losses of one batch: head by head, and after `fuse`."""
     images, masks = torch.tensor(frames.images[:16]), torch.tensor(frames.masks[:16])
     for fused in (False, True):
         module = MultiHeadAutoencoder(heads, EncoderSettings(beta=beta), 0)
@@ -367,7 +366,7 @@ def assert_same_step(frames: Frames, heads: str, beta: float, tolerance: float) 
         assert (ours - theirs).double().norm() <= tolerance * theirs.double().norm() / 10, name
 
 
-@pytest.mark.slow
+@pytest.mark.stress
 def test_a_compiled_step_is_the_step_head_by_head(frames: Frames, recwarn: pytest.WarningsRecorder) -> None:
     """Stated tolerance, in float32: 3e-5 of each loss, 0.3 % of BatchNorm's statistics, 3 % of each gradient's norm.
 
@@ -394,7 +393,7 @@ def test_what_cannot_be_compiled_trains_without_after_one_warning(
 
 
 def test_inside_an_epoch_nobody_waits_for_the_device(frames: Frames, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = questions(monkeypatch, MultiHeadAutoencoder, "training_step", "validation_step")
+    asked = record_synchronisations(monkeypatch, MultiHeadAutoencoder, "training_step", "validation_step")
     train(frames, "full", SETTINGS.model_copy(update={"beta": 0.5}))
     assert asked == []
 
@@ -499,7 +498,7 @@ def test_a_damaged_checkpoint_is_told_and_not_used(
     assert "damaged checkpoint" in capsys.readouterr().err
 
 
-@pytest.mark.slow
+@pytest.mark.stress
 def test_a_training_that_was_really_killed_goes_on(store: Path, frames: Frames, tmp_path: Path) -> None:
     """SIGKILL at a random moment after the first checkpoint, in a process of its own."""
     checkpoint = tmp_path / "checkpoint"

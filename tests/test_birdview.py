@@ -6,7 +6,6 @@ import hashlib
 import numpy as np
 import pytest
 
-from drives import crossing_drive
 from study.config.keys import FORMAT_VERSIONS
 from study.config.settings import BirdviewSettings
 from study.data import birdview
@@ -14,13 +13,14 @@ from study.data.birdview import Renderer, governing_light, render_birdview, vali
 from study.episode.checks import check_episode
 from study.episode.schema import GREEN, RED, YELLOW, Agent, Episode, Lane, Light, empty_states
 from study.errors import BadInputError
+from tests.support.drives import crossing_drive
 
 SETTINGS = BirdviewSettings()
 NOW = 10  # a step with a whole history and future
 
 
 def drive(tracks, sizes=(4.8, 2.0), routes=None, lanes=(), light=None):
-    """An Episode of 21 steps from tracks: for each agent (x, y, heading) at step 10 and the way per step [m]."""
+    """Return an Episode of 21 steps from tracks: each agent has (x, y, heading) at step 10 and a way per step [m]."""
     states = empty_states(21, len(tracks))
     for agent, (x, y, heading, pace) in enumerate(tracks):
         way = pace * (np.arange(21) - NOW)
@@ -52,13 +52,13 @@ def drive(tracks, sizes=(4.8, 2.0), routes=None, lanes=(), light=None):
 
 
 def from_ego(heading, ahead, left, ego=(5.0, -3.0)):
-    """World position of a point seen from the ego."""
+    """Return the world position of a point seen from the ego."""
     forward = np.array([np.cos(heading), np.sin(heading)])
     return np.array(ego) + ahead * forward + left * np.array([-forward[1], forward[0]])
 
 
 def pixel(ahead, left):
-    """Row and column of the pixel that shows a point seen from the ego (Sec. III-A: 40 m, 15 m behind the ego)."""
+    """Return row and column of the pixel of a point seen from the ego (Sec. III-A: 40 m, 15 m behind the ego)."""
     return int((25 - ahead) * 1.6), int((20 - left) * 1.6)
 
 
@@ -67,7 +67,7 @@ def straight_route(heading, start=-30.0, end=60.0):
 
 
 def covered(episode, step, agent, poses, others):
-    """Reference: pixels [256, 256] whose centre lies in a box at one of the steps, seen from the agent at `step`."""
+    """Return which pixels [256, 256] have their centre in a box at one of the steps, seen from the agent at `step`."""
     rows, columns = np.mgrid[:256, :256]
     ahead, left = 25 - (rows + 0.5) / 6.4, 20 - (columns + 0.5) / 6.4
     at = episode.heading[step, agent].astype(float)

@@ -25,7 +25,7 @@ SEEDS = 3
 
 @pytest.fixture
 def new_job(small_store, small_drives, tmp_path):
-    """What training a cell on the small frames needs, in a scratch folder of its own."""
+    """Return a function that makes a job on the small frames, in a scratch folder of its own."""
 
     def make(cell=REC, **changes):
         key = cell_key(SETTINGS, cell, SEEDS, open_frames(small_store).key)
@@ -36,7 +36,7 @@ def new_job(small_store, small_drives, tmp_path):
 
 
 def run(job, **how):
-    """The result, the network, and the stages that told of progress."""
+    """Return the result, the network, and the stages that reported progress."""
     stages = []
     result, network = run_flow(cell_flow(job, **how), progress=lambda stage, *_: stages.append(stage))
     return result, network, list(dict.fromkeys(stages))
@@ -55,7 +55,7 @@ def assert_same(one, other):
 
 @pytest.fixture
 def many_shares(monkeypatch):
-    """Each policy seed is worth a share."""
+    """Make every policy seed a share of its own."""
     monkeypatch.setattr(path, "SHARE_SECONDS", 1e-9)
 
 

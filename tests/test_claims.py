@@ -3,10 +3,10 @@ import dataclasses
 import pytest
 from scipy.stats import binom
 
-from simulated import DATASIZE_GRID, HEADS_GRID, Null, World, simulate
 from study.analysis import claims, comparisons, convergence, effects, intervals, learning_curves
 from study.config.grid import Grid, Rules
 from study.config.heads import HEAD_SETS
+from tests.support.synthetic_records import DATASIZE_GRID, HEADS_GRID, Null, World, simulate
 
 
 def outcomes(record):
@@ -115,7 +115,7 @@ OTHER_ENCODERS = Null(encoder=0.004, encoder_steering=0.07, spread=0.1)  # as fi
 
 
 def claims_an_effect(verdict):
-    """Whether some finding excludes that there is no effect, in whichever direction: the claim's or its opposite."""
+    """Return whether some finding excludes that there is no effect, in either direction."""
     nothing = {"points": 0.0, "ratio": 1.0}
     for finding in verdict.findings:
         low, high = finding.decides
@@ -126,13 +126,12 @@ def claims_an_effect(verdict):
     return False
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("grid", "null", "draws"),
     [
-        (HEADS_GRID.model_copy(update={"rules": FREE}), Null(), 150),
+        pytest.param(HEADS_GRID.model_copy(update={"rules": FREE}), Null(), 150, marks=pytest.mark.stress),
         (HEADS_GRID, OTHER_ENCODERS, 80),
-        (FIVE, OTHER_ENCODERS, 150),
+        pytest.param(FIVE, OTHER_ENCODERS, 150, marks=pytest.mark.stress),
         (FIVE, dataclasses.replace(OTHER_ENCODERS, fast=True), 60),
         (DATASIZE_GRID.model_copy(update={"rules": FREE}), Null(), 40),
     ],

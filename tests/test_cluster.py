@@ -12,8 +12,10 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
-from running import PLAN, Running, check_like, command, store, sweep, working_folder
-from servers import LOOPBACK, free_port
+from tests.support.processes import CommandProcess, sweep, sweep_command
+from tests.support.run_database import run_database
+from tests.support.servers import LOOPBACK, free_port
+from tests.support.sweeps import TINY_SWEEP, assert_same_outcome, working_folder
 
 pytestmark = pytest.mark.stress
 
@@ -49,7 +51,7 @@ def make_certificates(folder):
 
 
 class Cluster:
-    """A scheduler and three workers with their nannies, each started as its user would start it on its machine."""
+    """Runs a scheduler and three workers with their nannies, each started as a user starts it on its machine."""
 
     def __init__(self, folder):
         self.folder, self.port = folder, free_port()
@@ -63,7 +65,7 @@ class Cluster:
         folder.mkdir(exist_ok=True)
         pems = {"--tls-ca-file": "ca.pem", "--tls-cert": "cert.pem", "--tls-key": "key.pem"}
         tls = [word for option, file in pems.items() for word in (option, str(self.certificates / file))]
-        return Running(folder, sys.executable, "-m", "dask", *words, *tls, role=role)
+        return CommandProcess(folder, sys.executable, "-m", "dask", *words, *tls, role=role)
 
     def start_scheduler(self):
         words = ["scheduler", "--protocol", "tls", "--host", LOOPBACK, "--port", str(self.port), "--no-dashboard"]
@@ -75,7 +77,7 @@ class Cluster:
 
     def stop(self):
         for run in (self.scheduler, *self.workers):
-            run.send(signal.SIGKILL, *run.family())
+            run.send(signal.SIGKILL, *run.roles())
 
 
 @pytest.fixture
@@ -85,48 +87,48 @@ def cluster(tmp_path):
     made.stop()
 
 
-def test_three_machines_and_many_kills_end_with_the_table_of_one(quiet, cluster, tmp_path):
+def test_three_machines_and_many_kills_end_with_the_table_of_one(undisturbed, cluster, tmp_path):
     """Kills a worker, a nanny, the scheduler and the client; every worker makes the frames in a folder of its own."""
     folder = working_folder(tmp_path / "client")
     kills = Counter()
 
     def begin():
-        return Running(folder, *command(*PLAN, "--ceiling", "false", *cluster.words))
+        return CommandProcess(folder, *sweep_command(*TINY_SWEEP, "--ceiling", "false", *cluster.words))
 
     def kill(run, *roles):
-        pids = [pid for role in roles for pid in run.of(role)]
+        pids = [pid for role in roles for pid in run.pids(role)]
         kills["/".join(roles)] += run.send(signal.SIGKILL, *pids)
 
     run = begin()
-    assert run.until(lambda: store(folder).cells()["RUNNING"]), run.said
+    assert run.wait_for(lambda: run_database(folder).cell_counts()["RUNNING"]), run.output
     kill(cluster.workers[0], "worker")
     time.sleep(1)
     kill(cluster.workers[1], "nanny", "worker")
     cluster.workers[1] = cluster.start_worker(1)
-    assert run.until(lambda: store(folder).results()), run.said
+    assert run.wait_for(lambda: run_database(folder).digests()), run.output
     kill(cluster.scheduler, "scheduler")
-    code = run.end()
-    assert code == 2, run.said
-    assert "the scheduler" in run.said
-    assert "went away" in run.said
-    assert "Traceback" not in run.said
-    finished = set(store(folder).results())
+    code = run.wait()
+    assert code == 2, run.output
+    assert "the scheduler" in run.output
+    assert "went away" in run.output
+    assert "Traceback" not in run.output
+    finished = set(run_database(folder).digests())
 
-    cluster.scheduler.end()
+    cluster.scheduler.wait()
     cluster.scheduler = cluster.start_scheduler()
     for number, worker in enumerate(cluster.workers):
         kill(worker, "nanny", "worker")
         cluster.workers[number] = cluster.start_worker(number)
     run = begin()
-    assert run.until(lambda: store(folder).cells()["RUNNING"]) or run.end() == 0, run.said
+    assert run.wait_for(lambda: run_database(folder).cell_counts()["RUNNING"]) or run.wait() == 0, run.output
     kill(run, "client")
-    run.end()
-    assert finished <= set(store(folder).results())
+    run.wait()
+    assert finished <= set(run_database(folder).digests())
 
     run = begin()
-    assert run.end() == 0, run.said
-    print("kills", dict(kills), "runs of cells", dict(store(folder).cells()))
-    check_like(folder, quiet.folder)
+    assert run.wait() == 0, run.output
+    print("kills", dict(kills), "runs of cells", dict(run_database(folder).cell_counts()))
+    assert_same_outcome(folder, undisturbed.folder)
     assert not (folder / "data/frames").exists()
     assert all((tmp_path / f"machine{number}/data/frames").exists() for number in range(3))
 

@@ -8,16 +8,17 @@ import time
 
 import pytest
 
-from running import environment, sweep, working_folder
 from study.console.interrupts import STOP_SECONDS, check_stopped, stoppable
 from study.errors import EXIT_AGAIN, EXIT_INTERRUPTED
+from tests.support.processes import sweep
+from tests.support.sweeps import working_folder
 
 HEAVY = ("torch", "lightning", "mlflow", "optuna", "matplotlib", "highway_env", "cv2", "pandas", "distributed")
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A working folder of a newcomer: sweep files and nothing else."""
+    """Return a newcomer's working folder: sweep files and nothing else."""
     return working_folder(tmp_path_factory.mktemp("command"))
 
 
@@ -83,9 +84,7 @@ def test_help_and_dry_run_load_nothing_heavy(folder, words):
         "except SystemExit: pass\n"
         f"print([name for name in {HEAVY!r} if name in sys.modules], file=sys.stderr)"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=folder, env=environment()
-    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=folder)
     assert done.stderr.strip() == "[]"
 
 

@@ -1,23 +1,23 @@
 import json
 import re
-from pathlib import Path
 
 import pytest
 
-from simulated import HEADS_GRID, World, simulate
 from study.config.grid import Grid
 from study.errors import BadInputError
 from study.report.comparison import compare, difference
 from study.report.markdown import markdown
 from study.report.model import checked, read_report
 from study.report.summary import summarise
+from tests.support.processes import ROOT
+from tests.support.synthetic_records import HEADS_GRID, World, simulate
 
 SMALL = Grid(name="small", title="Small | <b>study</b>", heads=("rec", "full"), policy_seeds=4, claims=("H4",))
 FAST = World(epochs=12)
 
 
 def made(record):
-    """The content of a report.json, having been through JSON."""
+    """Return the content of a report.json."""
     return json.loads(summarise(record).json())
 
 
@@ -32,7 +32,7 @@ def content():
 
 @pytest.fixture(scope="module")
 def pair():
-    """Two commits' sweeps on the same frames: in the second, full is worse than rec."""
+    """Return two commits' sweeps on the same frames: in the second, full is worse than rec."""
     accuracy = {"rec": 0.835, "rec+pred": 0.847, "rec+plan": 0.862, "full": 0.60}
     other = made(simulate(HEADS_GRID, World(epochs=12, accuracy=accuracy), seed=1))
     other["provenance"] |= {"commit": "fedcba98" * 5}
@@ -46,7 +46,7 @@ def text(pair):
 
 
 def row(text, *starts):
-    """Cells of the first row that starts so."""
+    """Return the cells of the first row that starts so."""
     line = next(line for line in text.splitlines() if line.startswith("| " + " | ".join(starts)))
     return [cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]]
 
@@ -190,6 +190,6 @@ def test_a_file_that_is_no_report_is_refused(text, message, tmp_path):
         read_report(file)
 
 
-@pytest.mark.parametrize("folder", sorted(Path("reports/reference").glob("*/")), ids=lambda folder: folder.name)
+@pytest.mark.parametrize("folder", sorted((ROOT / "reports/reference").glob("*/")), ids=lambda folder: folder.name)
 def test_a_committed_report_is_read_and_written_again_without_a_change(folder):
     assert json.loads(read_report(folder).json()) == json.loads((folder / "report.json").read_text())

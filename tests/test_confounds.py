@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from simulated import DATASIZE_GRID, HEADS_GRID, World, simulate
 from study.analysis import comparisons
 from study.analysis.confounds import CONFOUNDS, concerned, contrasts, varied
 from study.config.files import load_grid
@@ -13,9 +12,11 @@ from study.config.settings import StudySettings
 from study.report.build import build_report
 from study.report.summary import summarise
 from study.sweep.plan import make_plan
+from tests.support.synthetic_records import DATASIZE_GRID, HEADS_GRID, World, simulate
 
 SPLIT = CONFOUNDS[0]
 FAST = World(epochs=8)
+PAIR = HEADS_GRID.model_copy(update={"heads": ("rec", "full")})
 
 
 def changed(**groups):
@@ -23,7 +24,7 @@ def changed(**groups):
 
 
 def with_variant(record, **more):
-    """The record, and one of the same kind whose frames are split differently."""
+    """Add a variant of the same kind whose frames are split differently."""
     other = simulate(seed=1, settings=changed(frames={"split": "frame"}), **more)
     grid = other.grid.model_copy(update={"name": "heads-split-frame"})
     return replace(record, variants={SPLIT.setting: replace(other, grid=grid)})
@@ -96,7 +97,7 @@ def test_a_sweep_without_variants_lists_how_to_run_each(tmp_path):
 
 
 def test_a_report_shows_the_differences_under_both_values(tmp_path):
-    pdf = build_report(with_variant(simulate(HEADS_GRID, FAST), world=FAST), tmp_path)
+    pdf = build_report(with_variant(simulate(PAIR, FAST), grid=PAIR, world=FAST), tmp_path)
     from pypdf import PdfReader
 
     text = " ".join(" ".join(page.extract_text().split()) for page in PdfReader(pdf).pages)

@@ -2,7 +2,6 @@
 
 import shutil
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -15,8 +14,8 @@ from study.engine.flows import run_flow
 from study.engine.local import local_engine
 from study.errors import BadInputError
 from study.stages import data_cost
+from tests.support.processes import ROOT
 
-SWEEPS = Path(__file__).parent.parent / "sweeps"
 TINY = {
     "town": {"vehicles": 30},
     "recording": {"warm_up": 1, "duration": 4, "encoder_episodes": 2, "policy_episodes": 2},
@@ -107,7 +106,7 @@ def test_a_folder_that_cannot_be_made_is_told(settings, tmp_path):
 
 
 def test_imported_drives_have_a_card_and_a_preview_too(root, tmp_path, monkeypatch, capsys):
-    shutil.copytree(SWEEPS, tmp_path / "sweeps")
+    shutil.copytree(ROOT / "sweeps", tmp_path / "sweeps")
     monkeypatch.chdir(tmp_path)
     episodes = next((root / "episodes").iterdir())
     assert main(["import", str(episodes), "--out", "mine"]) == 0

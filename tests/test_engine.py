@@ -16,14 +16,15 @@ import psutil
 import pytest
 import yaml
 
-from listening import listen
-from servers import free_port
 from study.engine import local, remote, workers
 from study.engine.flows import TRIES, run_flow
 from study.engine.local import local_engine, visible_gpus
 from study.engine.remote import check_address, cluster_engine, start_jobs
 from study.errors import BadInputError
 from study.stages import ENCODER, Batch, Task
+from tests.support.listeners import run_and_record
+from tests.support.processes import ROOT
+from tests.support.servers import free_port
 
 GPU = "7"
 
@@ -56,7 +57,7 @@ def work(steps, report):
 
 
 def die(diary, times):
-    """Note that this runs, and be killed the first times that it does."""
+    """Record the run in a diary, and die the first `times` times."""
     with diary.open("a") as stream:
         stream.write("run\n")
     if len(diary.read_text().split()) <= times:
@@ -70,7 +71,7 @@ def environment(name):
 
 
 def deaf_threads():
-    """For each thread of this process, whether it blocks SIGINT, as the kernel has it."""
+    """Return, for each thread of this process, whether the kernel has SIGINT blocked."""
     masks = []
     for status in Path("/proc/self/task").glob("*/status"):
         lines = dict(line.split(":\t", 1) for line in status.read_text().splitlines() if ":\t" in line)
@@ -82,18 +83,18 @@ def deaf_threads():
 
 
 def test_results_come_from_other_processes_in_the_order_of_the_tasks(engine):
-    heard = listen(engine, {name: flow(square, *((number,) for number in range(8))) for name in "ab"})
-    assert heard.products == {name: [number**2 for number in range(8)] for name in "ab"}
-    processes = [process for _, _, process in heard.starts]
+    events = run_and_record(engine, {name: flow(square, *((number,) for number in range(8))) for name in "ab"})
+    assert events.products == {name: [number**2 for number in range(8)] for name in "ab"}
+    processes = [process for _, _, process in events.starts]
     assert len(processes) == 16
     assert os.getpid() not in processes
 
 
 def test_whatever_a_task_reports_is_heard_before_its_end(engine):
-    heard = listen(engine, {str(number): flow(work, (3,), reports=True) for number in range(12)})
-    losses = [(name, epoch, metrics["loss"]) for name, _, epoch, metrics in heard.logs]
+    events = run_and_record(engine, {str(number): flow(work, (3,), reports=True) for number in range(12)})
+    losses = [(name, epoch, metrics["loss"]) for name, _, epoch, metrics in events.logs]
     assert sorted(losses) == sorted((str(number), step, 1 / step) for number in range(12) for step in (1, 2, 3))
-    assert Counter((done, total) for _, done, total in heard.steps) == dict.fromkeys([(0, 1), (1, 3), (2, 3)], 12) | {
+    assert Counter((done, total) for _, done, total in events.steps) == dict.fromkeys([(0, 1), (1, 3), (2, 3)], 12) | {
         (3, 3): 24
     }  # as told by the task, and by its end
 
@@ -107,19 +108,21 @@ def test_a_task_whose_worker_is_killed_runs_again(engine, tmp_path, times):
 
 def test_a_task_that_kills_every_worker_is_given_up_and_harms_no_other(engine, tmp_path):
     diary = tmp_path / "diary"
-    heard = listen(engine, {"deadly": flow(die, (diary, 99)), **{name: flow(square, (3,), (4,)) for name in "abc"}})
-    assert heard.products == {name: [9, 16] for name in "abc"}
-    assert heard.failures.keys() == {"deadly"}
-    assert f"killed {TRIES} times" in heard.failures["deadly"].reason
-    assert heard.failures["deadly"].exhausted
-    assert heard.reasons == []  # Dask has tried often enough
+    events = run_and_record(
+        engine, {"deadly": flow(die, (diary, 99)), **{name: flow(square, (3,), (4,)) for name in "abc"}}
+    )
+    assert events.products == {name: [9, 16] for name in "abc"}
+    assert events.failures.keys() == {"deadly"}
+    assert f"killed {TRIES} times" in events.failures["deadly"].reason
+    assert events.failures["deadly"].exhausted
+    assert events.retries == []  # Dask has tried often enough
     assert diary.read_text().split() == ["run"] * TRIES
 
 
 def test_a_result_that_cannot_travel_fails_its_flow_only(engine):
-    heard = listen(engine, {"back": flow(Lock, ()), "a": flow(square, (2,))})
-    assert heard.products == {"a": [4]}
-    assert "pickle" in heard.failures["back"].reason
+    events = run_and_record(engine, {"back": flow(Lock, ()), "a": flow(square, (2,))})
+    assert events.products == {"a": [4]}
+    assert "pickle" in events.failures["back"].reason
 
 
 def test_accelerated_tasks_run_where_the_gpu_is_seen(engine):
@@ -133,7 +136,7 @@ def test_a_gpu_whose_worker_restarts_is_waited_for(engine, tmp_path, monkeypatch
     monkeypatch.setattr(workers, "SIZE", 0.0)  # notices at once that the worker is gone
     dies = flow(die, (tmp_path / "diary", 1), accelerated=True)
     waits = flow(environment, *[("CUDA_VISIBLE_DEVICES",)] * 2, accelerated=True)
-    assert listen(engine, {"dies": dies, "waits": waits}).products == {"dies": ["alive"], "waits": [GPU, GPU]}
+    assert run_and_record(engine, {"dies": dies, "waits": waits}).products == {"dies": ["alive"], "waits": [GPU, GPU]}
 
 
 def test_a_file_is_seen_by_workers_of_the_same_folder(engine, tmp_path):
@@ -247,12 +250,15 @@ def test_jobs_of_a_batch_system_work_over_tls(tmp_path, monkeypatch):
     from dask_jobqueue.local import LocalCluster  # noqa: PLC0415 - takes a second
 
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "installed").mkdir()  # the job's machine has the study, but not this module
+    (tmp_path / "installed/study").symlink_to(ROOT / "study")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "installed"))
     with start_jobs(LocalCluster, {"memory": "1GB"}, 1, "batch.yaml") as engine:
         assert engine._address.startswith("tls://")  # noqa: SLF001
         assert run_flow(flow(mul, (5, 5), (6, 6)), engine) == [25, 36]
-        heard = listen(engine, {"lacking": flow(square, (5,)), "a": flow(mul, (2, 2))})  # this module is not there
-    assert heard.products == {"a": [4]}
-    assert "No module named 'test_engine'" in heard.failures["lacking"].reason
+        events = run_and_record(engine, {"lacking": flow(square, (5,)), "a": flow(mul, (2, 2))})
+    assert events.products == {"a": [4]}
+    assert "No module named 'tests'" in events.failures["lacking"].reason
     assert (tmp_path / "data" / "tmp" / "certificates").stat().st_mode & 0o077 == 0
     del engine
     gc.collect()  # its certificates are removed with it, and their folder after this test

@@ -7,17 +7,17 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from drives import crossing_drive
 from study.episode.files import FILES, file_digest, read_episode, write_episode
 from study.episode.schema import Episode
 from study.errors import BadInputError
+from tests.support.drives import crossing_drive
 
 STATES = ("x", "y", "heading", "speed", "steering", "acceleration", "light", "light_distance", "route_s", "lead_gap")
 
 
 @pytest.fixture(scope="module")
 def drive() -> Episode:
-    """A drive in which agents come and go."""
+    """Return a drive in which agents come and go."""
     episode = crossing_drive(seed=1, cars=6, steps=40)
     present = episode.present.copy()
     present[:10, 0] = False
@@ -105,7 +105,7 @@ def test_optional_columns_may_be_absent(folder):
 
 
 def put(field, row, value):
-    """A change of one value of a table."""
+    """Return a change of one value of a table."""
 
     def change(table):
         table.loc[row, field] = value

@@ -14,7 +14,6 @@ import pytest
 import torch
 from mlflow.models import Model
 
-from simulated import HEADS_GRID, World, simulate
 from study.driving.driver import export_driver
 from study.encoder.inputs import to_float
 from study.encoder.latents import encode
@@ -23,12 +22,13 @@ from study.policy.draws import initial_weights
 from study.policy.latents import normalisation
 from study.policy.networks import predict
 from study.tracking.model import write_model
+from tests.support.synthetic_records import HEADS_GRID, World, simulate
 
 SEEDS = 3
 
 
 def trained(how="zscore", seeds=SEEDS):
-    """A cell's result with weights of real networks."""
+    """Return a cell's result with weights of real networks."""
     grid = HEADS_GRID.model_copy(update={"policy_seeds": seeds, "heads": ("full",)})
     result = next(iter(simulate(grid, World(epochs=6)).results.values()))
     torch.manual_seed(0)
@@ -40,7 +40,7 @@ def trained(how="zscore", seeds=SEEDS):
 
 
 def said(result, count):
-    """What the policies say of the first sample images, by the way that trains and judges them."""
+    """Return the policies' answers to the first sample images, computed as in training."""
     return predict(result.policies, encode(result.encoder, result.samples["input"], np.arange(count)))
 
 

@@ -12,12 +12,14 @@ from contextlib import suppress
 
 import pytest
 
-from running import FOUR, ROOT, Running, Store, check_like, command, store, working_folder
-from servers import TrackingServer
+from tests.support.processes import ROOT, CommandProcess, sweep_command
+from tests.support.run_database import RunDatabase, run_database
+from tests.support.servers import TrackingServer
+from tests.support.sweeps import FOUR_CELLS, assert_same_outcome, working_folder
 
 pytestmark = pytest.mark.stress
 
-TWO = (*FOUR, "--heads", "[rec,full]")
+TWO = (*FOUR_CELLS, "--heads", "[rec,full]")
 HINT = "Nothing that was finished is lost"
 
 
@@ -25,24 +27,24 @@ HINT = "Nothing that was finished is lost"
 
 
 def entries(folder, pattern):
-    """Whether there is a file or folder of that pattern, hidden ones included."""
+    """Return whether a file or folder matches the pattern, hidden ones included."""
     return any(True for _ in folder.glob(pattern))
 
 
 def has_cells(run):
-    """Whether a cell has started."""
-    return store(run.folder).cells()["RUNNING"] > 0
+    """Return whether a cell has started."""
+    return run_database(run.folder).cell_counts()["RUNNING"] > 0
 
 
 SIGNS = {  # of a stage: something of it is going on
     "start": lambda run: True,
-    "engine": lambda run: run.of("worker"),
+    "engine": lambda run: run.pids("worker"),
     "record": lambda run: entries(run.folder, "data/episodes/*/*") and not entries(run.folder, "data/frames/*"),
     "render": lambda run: entries(run.folder, "data/frames/.*.building"),
-    "encoder": lambda run: run.of("worker") and has_cells(run),
-    "policy": lambda run: run.of("worker") and entries(run.folder, "data/products/encoder-*") and has_cells(run),
+    "encoder": lambda run: run.pids("worker") and has_cells(run),
+    "policy": lambda run: run.pids("worker") and entries(run.folder, "data/products/encoder-*") and has_cells(run),
     "commit": lambda run: entries(run.folder, "data/products/policies-*"),
-    "report": lambda run: "writing the report" in run.said,
+    "report": lambda run: "writing the report" in run.output,
 }
 LENGTH = {"start": 2.0, "engine": 2.0, "record": 1.0, "render": 0.6, "report": 2.0}  # [s] after the sign; else 0.8
 BLOWS = (  # stage, who is killed, how often; in the order in which a sweep gets there
@@ -57,7 +59,7 @@ STORM = 40  # kills at least
 LATER = {"record": "data/frames/*/manifest.json", "render": "data/frames/*/manifest.json"}  # the stage is over
 
 
-def test_a_storm_of_kills_changes_nothing(quiet, tmp_path):  # noqa: C901 - one story
+def test_a_storm_of_kills_changes_nothing(undisturbed, tmp_path):  # noqa: C901 - one story
     """SIGKILL at random moments of every stage, to the client and to workers."""
     rng = random.Random("storm")
     folder = working_folder(tmp_path)
@@ -68,7 +70,9 @@ def test_a_storm_of_kills_changes_nothing(quiet, tmp_path):  # noqa: C901 - one 
         while blows:
             stage, role = blows[-1]
             if run is None or not run.running:
-                run = Running(folder, *command(*FOUR), *([] if stage == "report" else ["--no-report"]))
+                run = CommandProcess(
+                    folder, *sweep_command(*FOUR_CELLS), *([] if stage == "report" else ["--no-report"])
+                )
 
             def over(stage=stage):
                 return stage in LATER and entries(folder, LATER[stage])
@@ -76,8 +80,8 @@ def test_a_storm_of_kills_changes_nothing(quiet, tmp_path):  # noqa: C901 - one 
             def sign(run=run, stage=stage, over=over):
                 return over() or SIGNS[stage](run)
 
-            if not run.until(sign):
-                if run.end() == 0 and stage != "report":  # every cell is finished: nothing is left to be hit there
+            if not run.wait_for(sign):
+                if run.wait() == 0 and stage != "report":  # every cell is finished: nothing is left to be hit there
                     for path in ("mlruns/mlflow.db", "data/products", "data/encoders"):
                         remove(folder / path)
                     kept = set()
@@ -85,27 +89,27 @@ def test_a_storm_of_kills_changes_nothing(quiet, tmp_path):  # noqa: C901 - one 
             if over():
                 for path in folder.glob("data/frames/*"):
                     remove(path)
-                run.send(signal.SIGKILL, *run.family())
-                run.end()
+                run.send(signal.SIGKILL, *run.roles())
+                run.wait()
                 if stage == "record":
                     remove(folder / "data/episodes")
                 continue
             time.sleep(rng.uniform(0, LENGTH.get(stage, 0.8)))
-            if sent := run.send(signal.SIGKILL, *run.of(role)[:1]):
+            if sent := run.send(signal.SIGKILL, *run.pids(role)[:1]):
                 kills[f"{stage}: {role}"] += sent
                 blows.pop()
             if role == "client":
-                run.end()
-                found = set(store(folder).folders())
+                run.wait()
+                found = set(run_database(folder).result_folders())
                 assert kept <= found, "a finished cell was lost"
                 kept = found
     if run is not None:
-        run.end()
-    run = Running(folder, *command(*FOUR))
-    assert run.end() == 0, run.said
-    print("kills", dict(kills), "runs of cells", dict(store(folder).cells()))
+        run.wait()
+    run = CommandProcess(folder, *sweep_command(*FOUR_CELLS))
+    assert run.wait() == 0, run.output
+    print("kills", dict(kills), "runs of cells", dict(run_database(folder).cell_counts()))
     assert kills.total() >= STORM
-    check_like(folder, quiet.folder)
+    assert_same_outcome(folder, undisturbed.folder)
 
 
 def remove(path):
@@ -118,32 +122,34 @@ def remove(path):
 # --- one fault at a time --------------------------------------------------------------------------------------------
 
 
-def test_a_client_that_stands_still_for_a_while_does_no_harm(quiet, tmp_path):
-    folder = quiet.copy(tmp_path)
-    run = Running(folder, *command(*TWO))
-    assert run.until(lambda: has_cells(run)), run.said
+def test_a_client_that_stands_still_for_a_while_does_no_harm(undisturbed, tmp_path):
+    folder = undisturbed.copy(tmp_path)
+    run = CommandProcess(folder, *sweep_command(*TWO))
+    assert run.wait_for(lambda: has_cells(run)), run.output
     run.send(signal.SIGSTOP, run.process.pid)
     time.sleep(15)
     run.send(signal.SIGCONT, run.process.pid)
-    assert run.end() == 0, run.said
-    check_like(folder, quiet.folder)
+    assert run.wait() == 0, run.output
+    assert_same_outcome(folder, undisturbed.folder)
 
 
-def test_of_two_clients_started_at_once_one_works_and_one_is_told(quiet, tmp_path):
-    folder = quiet.copy(tmp_path)
-    twins = [Running(folder, *command(*TWO), log=tmp_path / f"log{number}") for number in range(2)]
-    codes = [twin.end() for twin in twins]
+def test_of_two_clients_started_at_once_one_works_and_one_is_told(undisturbed, tmp_path):
+    folder = undisturbed.copy(tmp_path)
+    twins = [CommandProcess(folder, *sweep_command(*TWO), log=tmp_path / f"log{number}") for number in range(2)]
+    codes = [twin.wait() for twin in twins]
     assert sorted(codes) == [0, 2]
-    assert "another sweep" in twins[codes.index(2)].said
-    check_like(folder, quiet.folder)
+    assert "another sweep" in twins[codes.index(2)].output
+    assert_same_outcome(folder, undisturbed.folder)
 
 
-def test_a_second_client_waits_when_told_to(quiet, tmp_path):
-    folder = quiet.copy(tmp_path)
-    twins = [Running(folder, *command(*TWO), "--wait", log=tmp_path / f"log{number}") for number in range(2)]
-    assert [twin.end() for twin in twins] == [0, 0]
-    assert sum("waiting for another sweep" in twin.said for twin in twins) == 1
-    check_like(folder, quiet.folder)
+def test_a_second_client_waits_when_told_to(undisturbed, tmp_path):
+    folder = undisturbed.copy(tmp_path)
+    twins = [
+        CommandProcess(folder, *sweep_command(*TWO), "--wait", log=tmp_path / f"log{number}") for number in range(2)
+    ]
+    assert [twin.wait() for twin in twins] == [0, 0]
+    assert sum("waiting for another sweep" in twin.output for twin in twins) == 1
+    assert_same_outcome(folder, undisturbed.folder)
 
 
 POISON = """\
@@ -170,38 +176,38 @@ sys.meta_path.insert(0, Finder())
 """
 
 
-def test_a_cell_that_kills_its_worker_is_given_up_and_the_others_finish(quiet, tmp_path):
-    folder = quiet.copy(tmp_path / "sweep")
+def test_a_cell_that_kills_its_worker_is_given_up_and_the_others_finish(undisturbed, tmp_path):
+    folder = undisturbed.copy(tmp_path / "sweep")
     (tmp_path / "sitecustomize.py").write_text(POISON)
     path = os.pathsep.join([str(tmp_path), str(ROOT)])
-    run = Running(folder, *command(*FOUR), "--no-report", PYTHONPATH=path)
-    code = run.end()
-    assert code == 1, run.said
-    assert "failed: rec+pred 100% e0" in run.said
-    assert "killed 3 times" in run.said
-    assert len(store(folder).results()) == 3
-    run = Running(folder, *command(*FOUR))  # without the poison, the same command trains it
-    assert run.end() == 0, run.said
-    check_like(folder, quiet.folder)
+    run = CommandProcess(folder, *sweep_command(*FOUR_CELLS), "--no-report", PYTHONPATH=path)
+    code = run.wait()
+    assert code == 1, run.output
+    assert "failed: rec+pred 100% e0" in run.output
+    assert "killed 3 times" in run.output
+    assert len(run_database(folder).digests()) == 3
+    run = CommandProcess(folder, *sweep_command(*FOUR_CELLS))  # without the poison, the same command trains it
+    assert run.wait() == 0, run.output
+    assert_same_outcome(folder, undisturbed.folder)
 
 
-def test_damaged_files_are_told_and_made_again(quiet, tmp_path):
+def test_damaged_files_are_told_and_made_again(undisturbed, tmp_path):
     """A frame, a checkpoint and a kept product, damaged between two starts."""
-    folder = quiet.copy(tmp_path)
+    folder = undisturbed.copy(tmp_path)
     (image,) = folder.glob("data/frames/*/encoder/images.npy")
     for name in ("encoders", "products"):
-        shutil.copytree(quiet.folder / "data" / name, folder / "data" / name)
+        shutil.copytree(undisturbed.folder / "data" / name, folder / "data" / name)
     damaged = [image, *folder.glob("data/encoders/*"), *folder.glob("data/products/*/weights.safetensors")]
     assert len(damaged) == 9
     for path in damaged:
         content = bytearray(path.read_bytes())
         content[len(content) // 2] ^= 1
         path.write_bytes(content)
-    run = Running(folder, *command(*FOUR))
-    assert run.end() == 0, run.said
-    assert "damaged frames" in run.said
-    assert run.said.count("damaged checkpoint") == 4
-    check_like(folder, quiet.folder)
+    run = CommandProcess(folder, *sweep_command(*FOUR_CELLS))
+    assert run.wait() == 0, run.output
+    assert "damaged frames" in run.output
+    assert run.output.count("damaged checkpoint") == 4
+    assert_same_outcome(folder, undisturbed.folder)
 
 
 CLOCK = """\
@@ -216,73 +222,73 @@ time.time_ns = lambda: _time_ns() + int(shift() * 1e9)
 """
 
 
-def test_a_clock_that_is_set_forward_or_back_changes_no_result(quiet, tmp_path):
+def test_a_clock_that_is_set_forward_or_back_changes_no_result(undisturbed, tmp_path):
     """Five hours forward while a cell is trained, then ten back, which Dask does not survive."""
-    folder = quiet.copy(tmp_path / "sweep")
+    folder = undisturbed.copy(tmp_path / "sweep")
     (tmp_path / "sitecustomize.py").write_text(CLOCK)
     shift = tmp_path / "shift"
     shift.write_text("0")
     path = os.pathsep.join([str(tmp_path), str(ROOT)])
-    run = Running(folder, *command(*TWO, "--workers", "1"), PYTHONPATH=path, SHIFT=str(shift))
-    assert run.until(lambda: has_cells(run)), run.said
+    run = CommandProcess(folder, *sweep_command(*TWO, "--workers", "1"), PYTHONPATH=path, SHIFT=str(shift))
+    assert run.wait_for(lambda: has_cells(run)), run.output
     move(shift, 5)
-    assert run.until(lambda: store(folder).results()), run.said
+    assert run.wait_for(lambda: run_database(folder).digests()), run.output
     move(shift, -5)
-    assert run.end() == 2, run.said
-    assert "clock was set back by" in run.said
-    assert "Traceback" not in run.said
-    run = Running(folder, *command(*TWO, "--workers", "1"), PYTHONPATH=path, SHIFT=str(shift))
-    assert run.end() == 0, run.said
-    check_like(folder, quiet.folder)
+    assert run.wait() == 2, run.output
+    assert "clock was set back by" in run.output
+    assert "Traceback" not in run.output
+    run = CommandProcess(folder, *sweep_command(*TWO, "--workers", "1"), PYTHONPATH=path, SHIFT=str(shift))
+    assert run.wait() == 0, run.output
+    assert_same_outcome(folder, undisturbed.folder)
 
 
 def move(shift, hours):
-    """Set the clock, in one step for whoever looks at it."""
+    """Set the clock, atomically for its readers."""
     draft = shift.with_suffix(".draft")
     draft.write_text(str(hours * 3600))
     draft.replace(shift)
 
 
-def test_a_stopped_sweep_ends_within_five_seconds_and_says_how_to_go_on(quiet, tmp_path):
+def test_a_stopped_sweep_ends_within_five_seconds_and_says_how_to_go_on(undisturbed, tmp_path):
     """Ctrl-C, which reaches all processes of a terminal, and a batch system's SIGTERM, at any moment from the start."""
-    folder = quiet.copy(tmp_path)
+    folder = undisturbed.copy(tmp_path)
     rng = random.Random("stop")
     drives = ("--recording.duration", "3600", "--recording.warm_up", "0")  # drives that take minutes each
     epochs = ("--encoder.epochs", "3000")
     for words, sign, how, whom in (
-        ((*TWO, *drives), lambda run: "cells finished" in run.said, signal.SIGINT, "all"),
-        ((*TWO, *drives), lambda run: run.of("worker"), signal.SIGINT, "all"),
+        ((*TWO, *drives), lambda run: "cells finished" in run.output, signal.SIGINT, "all"),
+        ((*TWO, *drives), lambda run: run.pids("worker"), signal.SIGINT, "all"),
         ((*TWO, *drives), lambda run: entries(run.folder, "data/episodes/*/.lock"), signal.SIGTERM, "client"),
         ((*TWO, *epochs), has_cells, signal.SIGTERM, "client"),
         ((*TWO, *epochs), has_cells, signal.SIGINT, "all"),
-        ((*TWO, *epochs), lambda run: run.of("worker"), signal.SIGINT, "all"),
+        ((*TWO, *epochs), lambda run: run.pids("worker"), signal.SIGINT, "all"),
     ):
-        run = Running(folder, *command(*words))
-        assert run.until(lambda run=run, sign=sign: sign(run)), run.said
+        run = CommandProcess(folder, *sweep_command(*words))
+        assert run.wait_for(lambda run=run, sign=sign: sign(run)), run.output
         time.sleep(rng.uniform(0, 1))
         began = time.monotonic()
-        run.send(how, *(run.family() if whom == "all" else [run.process.pid]))
-        assert run.end() == 130, run.said
-        assert time.monotonic() - began < 5 * quiet.pace
-        assert HINT in run.said
-        assert "Traceback" not in run.said
-    run = Running(folder, *command(*TWO))
-    assert run.end() == 0, run.said
-    check_like(folder, quiet.folder)
+        run.send(how, *(run.roles() if whom == "all" else [run.process.pid]))
+        assert run.wait() == 130, run.output
+        assert time.monotonic() - began < 5 * undisturbed.slowdown
+        assert HINT in run.output
+        assert "Traceback" not in run.output
+    run = CommandProcess(folder, *sweep_command(*TWO))
+    assert run.wait() == 0, run.output
+    assert_same_outcome(folder, undisturbed.folder)
 
 
-def test_a_tracking_server_that_is_away_for_a_while_costs_nothing(quiet, tmp_path):
-    folder = quiet.copy(tmp_path / "sweep")
+def test_a_tracking_server_that_is_away_for_a_while_costs_nothing(undisturbed, tmp_path):
+    folder = undisturbed.copy(tmp_path / "sweep")
     server = TrackingServer(tmp_path / "server", f"sqlite:///{tmp_path}/server.db")
     try:
-        run = Running(folder, *command(*TWO), "--tracking", server.uri)
-        kept = Store(tmp_path / "server.db", tmp_path / "server/files")
-        assert run.until(lambda: kept.cells()["RUNNING"]), run.said
+        run = CommandProcess(folder, *sweep_command(*TWO), "--tracking", server.uri)
+        kept = RunDatabase(tmp_path / "server.db", tmp_path / "server/files")
+        assert run.wait_for(lambda: kept.cell_counts()["RUNNING"]), run.output
         server.stop()
         time.sleep(20)
         server.start()
-        assert run.end() == 0, run.said
-        check_like(folder, quiet.folder, kept)
+        assert run.wait() == 0, run.output
+        assert_same_outcome(folder, undisturbed.folder, kept)
     finally:
         server.stop()
 
@@ -291,7 +297,7 @@ def test_a_tracking_server_that_is_away_for_a_while_costs_nothing(quiet, tmp_pat
 
 
 class SmallDisk:
-    """A tmpfs that can be filled and emptied while a command works on it."""
+    """Mounts a tmpfs that can be filled and emptied while a command works on it."""
 
     def __init__(self, folder):
         self.folder, self.ballast = folder, folder / "ballast"
@@ -320,17 +326,17 @@ def disk(tmp_path):
     made.remove()
 
 
-def test_a_full_disk_is_told_at_every_stage_and_costs_nothing(quiet, disk, tmp_path):
+def test_a_full_disk_is_told_at_every_stage_and_costs_nothing(undisturbed, disk, tmp_path):
     working_folder(disk.folder)
     for stage in ("record", "render", "encoder", "commit"):
-        run = Running(disk.folder, *command(*TWO), log=tmp_path / "log")
-        assert run.until(lambda run=run, stage=stage: SIGNS[stage](run)), run.said
+        run = CommandProcess(disk.folder, *sweep_command(*TWO), log=tmp_path / "log")
+        assert run.wait_for(lambda run=run, stage=stage: SIGNS[stage](run)), run.output
         disk.fill()
-        assert run.end() in (1, 2), run.said
-        assert re.search("No space left|disk is full|make room", run.said), run.said
+        assert run.wait() in (1, 2), run.output
+        assert re.search("No space left|disk is full|make room", run.output), run.output
         if stage in ("record", "render"):
-            assert "Traceback" not in run.said
+            assert "Traceback" not in run.output
         disk.empty()
-    run = Running(disk.folder, *command(*TWO), log=tmp_path / "log")
-    assert run.end() == 0, run.said
-    check_like(disk.folder, quiet.folder)
+    run = CommandProcess(disk.folder, *sweep_command(*TWO), log=tmp_path / "log")
+    assert run.wait() == 0, run.output
+    assert_same_outcome(disk.folder, undisturbed.folder)

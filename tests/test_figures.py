@@ -4,7 +4,6 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 
-from simulated import DATASIZE_GRID, HEADS_GRID, World, simulate
 from study.analysis import intervals, learning_curves
 from study.config.grid import Grid
 from study.config.heads import HEAD_SETS
@@ -12,6 +11,7 @@ from study.errors import BadInputError
 from study.figures import curves, differences, pictures, style
 from study.report.drawings import draw, draw_sweeps
 from study.report.summary import summarise
+from tests.support.synthetic_records import DATASIZE_GRID, HEADS_GRID, World, simulate
 
 
 @pytest.fixture(scope="module")
@@ -191,7 +191,7 @@ def two(reports):
 
 
 def marks(axes):
-    """Place, marker and whether it is filled, of every mark in a panel."""
+    """Return place, marker and fill of every mark in a panel."""
     return {
         (round(float(line.get_xdata()[0]), 6), line.get_marker(), line.get_markerfacecolor() != "white")
         for line in axes.lines

@@ -6,18 +6,18 @@ from collections import deque
 
 import pytest
 
-from listening import listen
 from study.engine.flows import TRIES, FlowFailedError, run_flow
 from study.engine.tasks import perform
 from study.errors import BadInputError, TrainingDivergedError
 from study.stages import ENCODER, LATENTS, POLICY, Batch, Task
+from tests.support.listeners import run_and_record
 
 RETRIED = [OSError("the disk is away"), MemoryError(), RuntimeError("CUDA out of memory. Tried to allocate 2 GiB")]
 GIVEN_UP = [BadInputError("no such device"), TrainingDivergedError("loss is nan"), ValueError("shapes differ")]
 
 
 class Machine:
-    """An engine with any number of slots and GPUs: tasks run in this process when `wait` is called, one each time.
+    """Stands for an engine with any number of slots and GPUs: each call of `wait` runs one task in this process.
 
     `last_first`: the task that was submitted last ends first. Submitted tasks count as running, and a cancelled one
     still ends, as it may on a cluster.
@@ -49,7 +49,7 @@ class Machine:
 
 
 def run(flows, engine=None):
-    return listen(engine or Machine(), flows)
+    return run_and_record(engine or Machine(), flows)
 
 
 def note(diary, word):
@@ -70,7 +70,7 @@ def tasks(function, *argument_lists, **options):
 
 
 def steps(diary, name, *counts):
-    """A flow whose batches have that many tasks each; they note what they are."""
+    """Make a flow whose batches have that many tasks each; the tasks record themselves in a diary."""
     results = []
     for number, count in enumerate(counts):
         results += yield Batch(tasks(note, *((diary, f"{name}{number}{index}") for index in range(count))))
@@ -99,14 +99,14 @@ def test_later_flows_begin_only_where_there_is_room():
         begun.append(name)
         return (yield Batch(tasks("".join, (begun,), (begun,))))
 
-    heard = run({name: flow(name) for name in "abc"}, Machine(slots=2))
-    assert heard.products == {"a": ["a", "ab"], "b": ["ab", "abc"], "c": ["abc", "abc"]}
+    events = run({name: flow(name) for name in "abc"}, Machine(slots=2))
+    assert events.products == {"a": ["a", "ab"], "b": ["ab", "abc"], "c": ["abc", "abc"]}
 
 
 @pytest.mark.parametrize("last_first", [False, True])
 def test_results_come_back_in_the_order_of_the_tasks(last_first):
-    heard = run({"a": steps([], "a", 4, 2)}, Machine(slots=4, last_first=last_first))
-    assert heard.products == {"a": ["a00", "a01", "a02", "a03", "a10", "a11"]}
+    events = run({"a": steps([], "a", 4, 2)}, Machine(slots=4, last_first=last_first))
+    assert events.products == {"a": ["a00", "a01", "a02", "a03", "a10", "a11"]}
 
 
 @pytest.mark.parametrize("counts", [(), (0,), (0, 0), (0, 2), (1, 0), (1, 0, 0, 1)])
@@ -125,7 +125,7 @@ def test_where_no_worker_has_come_yet_a_task_waits_for_the_first():
 
 
 def mixed(count):
-    """Accelerated tasks and as many plain ones, all at once."""
+    """Make a flow of accelerated tasks and as many plain ones, all at once."""
     arguments = [([], "task")] * count
     yield Batch([*tasks(note, *arguments, accelerated=True), *tasks(note, *arguments)])
 
@@ -151,29 +151,29 @@ def test_without_gpus_all_tasks_share_the_slots():
 @pytest.mark.parametrize("error", RETRIED, ids=lambda error: type(error).__name__)
 def test_a_failure_that_may_pass_is_given_up_after_the_last_try(error):
     calls = []
-    heard = run({"a": iter_batch(tasks(raising, (error, calls)))})
-    assert (len(calls), len(heard.reasons)) == (TRIES, TRIES - 1)
-    assert heard.failures["a"].transient
-    assert type(error).__name__ in heard.failures["a"].reason
-    assert heard.products == {}
+    events = run({"a": iter_batch(tasks(raising, (error, calls)))})
+    assert (len(calls), len(events.retries)) == (TRIES, TRIES - 1)
+    assert events.failures["a"].transient
+    assert type(error).__name__ in events.failures["a"].reason
+    assert events.products == {}
 
 
 @pytest.mark.parametrize("error", RETRIED, ids=lambda error: type(error).__name__)
 def test_a_failure_that_passes_leaves_the_result(error):
     calls = []
-    heard = run({"a": iter_batch(tasks(raising, (error, calls, TRIES - 1)))})
-    assert (heard.products, heard.failures) == ({"a": ["done"]}, {})
+    events = run({"a": iter_batch(tasks(raising, (error, calls, TRIES - 1)))})
+    assert (events.products, events.failures) == ({"a": ["done"]}, {})
     assert len(calls) == TRIES
 
 
 @pytest.mark.parametrize("error", GIVEN_UP, ids=lambda error: type(error).__name__)
 def test_a_failure_that_would_come_again_is_not_tried_again(error):
     calls = []
-    heard = run({"a": iter_batch(tasks(raising, (error, calls)))})
-    assert (len(calls), heard.reasons) == (1, [])
-    assert not heard.failures["a"].transient
-    assert str(error) in heard.failures["a"].reason
-    assert ("Traceback" in heard.failures["a"].reason) == (not heard.failures["a"].expected)
+    events = run({"a": iter_batch(tasks(raising, (error, calls)))})
+    assert (len(calls), events.retries) == (1, [])
+    assert not events.failures["a"].transient
+    assert str(error) in events.failures["a"].reason
+    assert ("Traceback" in events.failures["a"].reason) == (not events.failures["a"].expected)
 
 
 def test_the_tries_of_one_task_are_not_counted_for_another():
@@ -195,9 +195,9 @@ def test_a_flow_that_fails_leaves_the_others_and_runs_none_of_its_own_tasks():
         finally:
             closed.append(True)
 
-    heard = run({"a": steps(diary, "a", 1, 1), "broken": broken(), "b": steps(diary, "b", 1)})
-    assert heard.products == {"a": ["a00", "a10"], "b": ["b00"]}
-    assert heard.failures.keys() == {"broken"}
+    events = run({"a": steps(diary, "a", 1, 1), "broken": broken(), "b": steps(diary, "b", 1)})
+    assert events.products == {"a": ["a00", "a10"], "b": ["b00"]}
+    assert events.failures.keys() == {"broken"}
     assert diary == ["a00", "a10", "b00"]
     assert closed == [True]
 
@@ -205,8 +205,8 @@ def test_a_flow_that_fails_leaves_the_others_and_runs_none_of_its_own_tasks():
 def test_what_still_ran_when_its_flow_failed_changes_nothing():
     """On a cluster a task cannot be called back; here its result comes after its flow's end."""
     failing = [*tasks(raising, (ValueError("no"), [])), *tasks(note, ([], "late"))]
-    heard = run({"broken": iter_batch(failing), "b": steps([], "b", 1)}, Machine(slots=3))
-    assert (heard.products, heard.failures.keys()) == ({"b": ["b00"]}, {"broken"})
+    events = run({"broken": iter_batch(failing), "b": steps([], "b", 1)}, Machine(slots=3))
+    assert (events.products, events.failures.keys()) == ({"b": ["b00"]}, {"broken"})
 
 
 @pytest.mark.parametrize(
@@ -225,9 +225,9 @@ def test_an_error_between_the_stages_of_a_flow_fails_that_flow_only(error, trans
         yield from steps([], "x", *[1] * batches)
         raise error
 
-    heard = run({"a": steps([], "a", 1), "broken": flow(), "b": steps([], "b", 1)})
-    assert heard.products.keys() == {"a", "b"}
-    failure = heard.failures["broken"]
+    events = run({"a": steps([], "a", 1), "broken": flow(), "b": steps([], "b", 1)})
+    assert events.products.keys() == {"a", "b"}
+    failure = events.failures["broken"]
     assert failure.transient == transient
     assert says in failure.reason
 
@@ -262,15 +262,15 @@ def test_every_start_is_told_with_host_and_process():
 def test_logged_means_are_over_the_weights_of_the_tasks():
     first = [("log", 1, {"loss": 0.0, "accuracy": 1.0})]
     second = [("log", 1, {"loss": 4.0, "accuracy": 0.0})]
-    heard = run({"a": iter_batch(reporting(first, second, weights=[1, 3]))})
-    assert heard.logs == [("a", "policy", 1, {"loss": 3.0, "accuracy": 0.25})]
+    events = run({"a": iter_batch(reporting(first, second, weights=[1, 3]))})
+    assert events.logs == [("a", "policy", 1, {"loss": 3.0, "accuracy": 0.25})]
 
 
 def test_an_epoch_is_told_when_all_tasks_have_reported_it_and_no_sooner():
     ahead = [("log", epoch, {"loss": 1.0}) for epoch in (1, 2, 3)]
     behind = [("log", epoch, {"loss": 3.0}) for epoch in (1, 2)]
-    heard = run({"a": iter_batch(reporting(ahead, behind)), "b": iter_batch(reporting(behind))})
-    assert [(name, epoch, metrics["loss"]) for name, _, epoch, metrics in heard.logs] == [
+    events = run({"a": iter_batch(reporting(ahead, behind)), "b": iter_batch(reporting(behind))})
+    assert [(name, epoch, metrics["loss"]) for name, _, epoch, metrics in events.logs] == [
         ("a", 1, 2.0),
         ("a", 2, 2.0),
         ("b", 1, 3.0),

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drives import write_drives
 from study.config.keys import FORMAT_VERSIONS
 from study.config.settings import BirdviewSettings, FramesSettings
 from study.data.birdview import render_birdview
@@ -23,6 +22,7 @@ from study.engine.flows import run_flow
 from study.engine.local import local_engine
 from study.episode.files import episode_digest, read_episode
 from study.errors import BadInputError
+from tests.support.drives import write_drives
 
 FRAMES = FramesSettings(encoder=120, policy=60, spacing=0.5)
 VIEW = BirdviewSettings()
@@ -43,7 +43,7 @@ def built(drives, tmp_path_factory):
 
 @pytest.fixture
 def store(built, tmp_path):
-    """A copy that may be broken."""
+    """Return a copy that a test may damage."""
     return Path(shutil.copytree(built, tmp_path / "store"))
 
 
@@ -117,10 +117,10 @@ if __name__ == "__main__":
 
 def start(script, folder, stage, done, workers, drives):
     arguments = [str(folder), stage, str(done), str(workers), *map(str, (*drives[0], *drives[1]))]
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent.parent)}
-    return subprocess.Popen([sys.executable, str(script), *arguments], env=environment)
+    return subprocess.Popen([sys.executable, str(script), *arguments])
 
 
+@pytest.mark.stress
 @pytest.mark.parametrize(("stage", "done", "workers"), [("select", 4, 1), ("render", 1, 1), ("render", 100, 2)])
 def test_a_killed_build_goes_on_and_ends_the_same(built, drives, tmp_path, stage, done, workers):
     """Killed for real; what is rendered is not rendered again; a note that is not whole is no harm."""
@@ -139,6 +139,7 @@ def test_a_killed_build_goes_on_and_ends_the_same(built, drives, tmp_path, stage
     assert open_frames(folder, check=True).manifest == open_frames(built).manifest
 
 
+@pytest.mark.stress
 def test_an_unfinished_build_of_other_settings_is_not_taken_up(drives, tmp_path):
     script = tmp_path / "killed.py"
     script.write_text(KILLED)
@@ -148,6 +149,7 @@ def test_an_unfinished_build_of_other_settings_is_not_taken_up(drives, tmp_path)
     assert opened.manifest["settings"]["frames"]["seed"] == 1
 
 
+@pytest.mark.stress
 def test_two_builds_at_once_make_one_store(built, drives, tmp_path):
     script = tmp_path / "build.py"
     script.write_text(KILLED)

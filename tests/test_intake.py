@@ -7,14 +7,15 @@ import shutil
 import numpy as np
 import pytest
 
-from running import store
-from simulated import EPISODES, FRAMES, World, simulate_cell
 from study.errors import EXIT_INTERRUPTED, BadInputError
 from study.results.cell_result import load_results
 from study.sweep.__main__ import main
 from study.sweep.offline_results import planned_results, take_in
 from study.sweep.plan import make_plan
 from study.tracking.tracker import Tracker
+from tests.support.processes import ROOT
+from tests.support.run_database import run_database
+from tests.support.synthetic_records import EPISODES, FRAMES, World, simulate_cell
 
 PLAN = (
     "heads",
@@ -38,7 +39,7 @@ def plan():
 
 @pytest.fixture(scope="module")
 def trained(plan, tmp_path_factory):
-    """What study.sweep train leaves."""
+    """Return a folder as study.sweep train leaves it."""
     folder = tmp_path_factory.mktemp("trained")
     rng = np.random.default_rng(0)
     labels = (
@@ -58,14 +59,14 @@ def trained(plan, tmp_path_factory):
 
 @pytest.fixture
 def folder(trained, tmp_path):
-    """A copy that a test may spoil."""
+    """Return a copy that a test may damage."""
     return shutil.copytree(trained, tmp_path / "results")
 
 
 @pytest.fixture
-def here(tmp_path, monkeypatch, request):
-    """An empty working folder."""
-    shutil.copytree(request.config.rootpath / "sweeps", tmp_path / "sweeps")
+def here(tmp_path, monkeypatch):
+    """Enter an empty working folder."""
+    shutil.copytree(ROOT / "sweeps", tmp_path / "sweeps")
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -82,10 +83,10 @@ def test_an_import_that_was_stopped_goes_on_and_commits_every_cell_once(here, pl
     monkeypatch.setattr(Tracker, "commit", stopped)
     assert main([*PLAN, "--import-results", str(folder)]) == EXIT_INTERRUPTED
     monkeypatch.setattr(Tracker, "commit", commit)
-    assert store(here).cells() == {"FINISHED": 1, "KILLED": 1}
+    assert run_database(here).cell_counts() == {"FINISHED": 1, "KILLED": 1}
     for _ in range(2):
         assert main([*PLAN, "--import-results", str(folder)]) == 0
-        assert store(here).cells() == {"FINISHED": 2, "KILLED": 1}
+        assert run_database(here).cell_counts() == {"FINISHED": 2, "KILLED": 1}
 
     record = Tracker().read_sweep("heads")
     assert record.complete
@@ -106,7 +107,7 @@ def test_what_is_missing_is_listed_and_not_trained(here, plan, folder, empty_sto
     said = capsys.readouterr().err
     assert f"missing: rec 100% e0 ({gone})" in said
     assert f"full 100% e0 ({there}): imported" in said
-    assert store(here).cells() == {"FINISHED": 1}
+    assert run_database(here).cell_counts() == {"FINISHED": 1}
     assert not (here / "data").exists()
 
 
@@ -117,7 +118,7 @@ def damage(path):
 
 
 def edit(change):
-    """A result whose files are whole, but which is not what it says."""
+    """Change a result whose files stay intact."""
 
     def spoil(folder):
         result = next(result for result in load_results(folder.parent) if result.key == folder.name)

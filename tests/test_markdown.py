@@ -5,7 +5,6 @@ from dataclasses import replace
 import pytest
 from pypdf import PdfReader
 
-from simulated import DATASIZE_GRID, HEADS_GRID, World, simulate
 from study.config.grid import Grid
 from study.config.settings import StudySettings
 from study.report.build import build_report
@@ -13,6 +12,7 @@ from study.report.markdown import markdown
 from study.report.rounding import between, epochs, fixed, percent, points
 from study.report.summary import summarise
 from study.report.text import document
+from tests.support.synthetic_records import DATASIZE_GRID, HEADS_GRID, World, simulate
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +25,7 @@ def written(report):
 
 
 def part(text, title):
-    """The text below a heading, up to the next."""
+    """Return the text below a heading, up to the next."""
     return re.split(r"^#+ ", text.partition(f"# {title}\n")[2], maxsplit=1, flags=re.MULTILINE)[0]
 
 
@@ -43,7 +43,7 @@ def test_the_tables_hold_the_numbers_of_the_report(report):
 
 
 def cells(text, start):
-    """Cells of the first row that starts so."""
+    """Return the cells of the first row that starts so."""
     line = next(line for line in text.splitlines() if line.startswith(f"| {start} |"))
     return [cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]]
 

@@ -1,36 +1,35 @@
 """What a person sees of a sweep in MLflow's own pages, on a real server.
 
-Everything is checked by the requests that the pages make. Where a browser is found it is checked on the pages, too:
-no package of a lock file carries one that starts without libraries of the system.
+The requests that the pages make are checked everywhere, the pages themselves where the system has a Chromium.
 """
 
 import http.client
 import json
 import re
 import shutil
-import tempfile
 import urllib.parse
 from pathlib import Path
 
 import mlflow
 import pytest
 import torch
+from playwright.sync_api import Page, expect, sync_playwright
 
-from browser import Browser, program
-from servers import LOOPBACK, TrackingServer
-from simulated import HEADS_GRID, World, simulate
 from study.data.card import card_files
 from study.data.frames import open_frames
 from study.driving.driver import export_driver
 from study.tracking.tracker import Tracker
+from tests.support.processes import ROOT
+from tests.support.servers import LOOPBACK, TrackingServer
+from tests.support.synthetic_records import HEADS_GRID, World, simulate
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.stress
 
 ACCURACY, STEERING = "policy/test/acceleration_accuracy", "policy/test/steering_loss"
 COLUMNS = ("heads", "fraction", "encoder_seed", "policy_seeds", "state", "final/acceleration_accuracy")
 LABELS = ("full 100% e0", "rec 100% e0", "rec+plan 100% e0", "rec+pred 100% e0")
 EPOCHS, SEEDS = 8, 2
-REFERENCE = Path(__file__).parents[1] / "reports" / "reference" / "heads"
+REFERENCE = ROOT / "reports/reference/heads"
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +41,7 @@ def server(empty_store, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def sweep(server, small_store, small_drives):
-    """A finished sweep of the four head sets: drawn curves, a real report, the card of real frames, models."""
+    """Log a finished sweep of the four head sets: drawn curves, a real report, the card of real frames, models."""
     record = simulate(HEADS_GRID.model_copy(update={"policy_seeds": SEEDS, "ceiling": False}), World(epochs=EPOCHS))
     tracker = Tracker(server.uri)
     run_id = tracker.open_sweep(
@@ -60,7 +59,7 @@ def sweep(server, small_store, small_drives):
 
 
 def ask(server, path, **body):
-    """A page's own request: POST where it has a body."""
+    """Send a page's own request, a POST where it has a body."""
     connection = http.client.HTTPConnection(LOOPBACK, server.port, timeout=120)
     words = ("POST", json.dumps(body), {"Content-Type": "application/json"}) if body else ("GET", None, {})
     connection.request(words[0], f"/{path}", *words[1:])
@@ -83,7 +82,7 @@ def experiment(server, sweep):
 
 @pytest.fixture(scope="module")
 def address(server, experiment):
-    """Where the link in the experiment's description leads."""
+    """Return the address behind the link in the experiment's description."""
     link = re.search(r"\[All cells with their scores\]\((.+?)\)", experiment[1]["mlflow.note.content"]).group(1)
     return f"{server.uri}/{link}"
 
@@ -163,28 +162,42 @@ def test_a_model_comes_back_from_the_server(server, cells, monkeypatch):
 
 # --- by the pages themselves ----------------------------------------------------------------------------------------
 
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+PATIENCE = 180_000.0  # [ms] for a page to show what it should; a busy machine is slow
+
 
 @pytest.fixture(scope="module")
-def browser():
-    if program() is None:
-        pytest.skip("no Chromium on this machine; the pages' requests are checked all the same")
-    # A short path: Chromium keeps a socket below it.
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as name, Browser(Path(name), (2600, 1000)) as opened:
-        yield opened
+def page():
+    program = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if program is None:
+        pytest.skip("no Chromium on this machine; the requests of the pages are checked all the same")
+    expect.set_options(timeout=PATIENCE)
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=program, chromium_sandbox=False, timeout=PATIENCE)
+        page = browser.new_page(viewport={"width": 2600, "height": 1000})
+        page.set_default_timeout(PATIENCE)
+        yield page
+        browser.close()
 
 
-SHOWN = "document.body.innerText.includes({})"
+def open_page(page: Page, address):
+    """Load an address anew: MLflow's pages differ only in what follows the #, which a browser takes for the same."""
+    page.goto("about:blank")
+    page.goto(address)
+
+
 # Charts whose lines end at as many different values as there are cells; MLflow draws each line twice.
-DRAWN = """[...document.querySelectorAll('.js-plotly-plot')].filter(plot => plot.data && new Set(plot.data
-    .filter(line => line.y && line.y.length == {points}).map(line => line.y[line.y.length - 1])).size == {lines})
-    .length == {charts}"""
+DRAWN = """({points, lines, charts}) => [...document.querySelectorAll('.js-plotly-plot')]
+    .filter(plot => plot.data && new Set(plot.data.filter(line => line.y && line.y.length == points)
+    .map(line => line.y[line.y.length - 1])).size == lines).length == charts"""
 
 
-def test_the_list_of_cells_as_a_person_sees_it(browser, address, cells):
-    browser.open(address)
+def test_the_list_of_cells_shows_their_states_and_scores(page, address, cells):
+    open_page(page, address)
+    body = page.locator("body")
     for label in LABELS:
-        browser.wait(SHOWN.format(json.dumps(label)))
-    text = browser.text()
+        expect(body).to_contain_text(label)
+    text = body.inner_text()
     for column in COLUMNS:
         assert column in text
     assert text.count("finished") == len(LABELS)
@@ -193,22 +206,22 @@ def test_the_list_of_cells_as_a_person_sees_it(browser, address, cells):
         assert str(accuracy) in text
 
 
-def test_the_charts_of_the_cells_are_mean_curves(browser, address):
-    browser.open(f"{address}&compareRunsMode=CHART")
-    browser.wait(DRAWN.format(points=EPOCHS, lines=len(LABELS), charts=2))
+def test_the_charts_of_the_cells_are_mean_curves(page, address):
+    open_page(page, f"{address}&compareRunsMode=CHART")
+    page.wait_for_function(DRAWN, arg={"points": EPOCHS, "lines": len(LABELS), "charts": 2})
 
 
-def test_the_report_opens_where_it_was_filed(browser, server, experiment, sweep):
-    page = f"{server.uri}/#/experiments/{experiment[0]}/runs/{sweep}/artifacts"
-    browser.open(f"{page}/report/report.pdf?workflowType=machine_learning")
-    browser.wait("[...document.querySelectorAll('canvas')].some(page => page.width > 100 && page.height > 100)")
-    browser.open(f"{page}/figures/test_compare_heads.png?workflowType=machine_learning")
-    browser.wait("[...document.images].some(image => image.complete && image.naturalWidth > 500)")
-    assert {"data.json", "plan.json"} <= set(browser.text().split())
+def test_the_report_opens_where_it_was_filed(page, server, experiment, sweep):
+    artifacts = f"{server.uri}/#/experiments/{experiment[0]}/runs/{sweep}/artifacts"
+    open_page(page, f"{artifacts}/report/report.pdf?workflowType=machine_learning")
+    page.wait_for_function("[...document.querySelectorAll('canvas')].some(page => page.width > 100)")
+    open_page(page, f"{artifacts}/figures/test_compare_heads.png?workflowType=machine_learning")
+    page.wait_for_function("[...document.images].some(image => image.complete && image.naturalWidth > 500)")
+    assert {"data.json", "plan.json"} <= set(page.locator("body").inner_text().split())
 
 
-def test_the_models_are_listed(browser, server, experiment):
-    browser.open(f"{server.uri}/#/experiments/{experiment[0]}/models?workflowType=machine_learning")
+def test_the_models_are_listed(page, server, experiment):
+    open_page(page, f"{server.uri}/#/experiments/{experiment[0]}/models?workflowType=machine_learning")
     for label in LABELS:
-        browser.wait(SHOWN.format(json.dumps(label)))
-    assert "driver" in browser.text()
+        expect(page.locator("body")).to_contain_text(label)
+    assert "driver" in page.locator("body").inner_text()

@@ -22,14 +22,14 @@ from study.policy.metrics import METRICS, Labels, likeliest, measure
 from study.policy.networks import WIDTHS, Layer, Scratch, dropped, forward_backward, predict
 from study.policy.training import TrainedPolicies, join_policies, train_policies
 from study.results.cell_result import CURVE_COLUMNS
-from waiting import questions
+from tests.support.synchronisation import record_synchronisations
 
 SETTINGS = PolicySettings(epochs=5, batch=64, lr=5e-3)
 TRAIN, TEST = 300, 120  # 300 is no multiple of 64: the last batch is short
 
 
 def drive(frames: int, seed: int, noise: float = 0.3) -> tuple[np.ndarray, pd.DataFrame]:
-    """Latents far from zero mean and unit deviation, and labels that a policy can read off them."""
+    """Draw latents far from zero mean and unit deviation, and labels that a policy can read off them."""
     rng = np.random.default_rng(seed)
     signal = rng.normal(size=(frames, 64))
     wish = signal[:, 0] + signal[:, 1] + noise * rng.normal(size=frames)
@@ -111,7 +111,7 @@ def test_all_seeds_as_one_group_come_out_as_one_group_each(
 
 def test_inside_an_epoch_nobody_waits_for_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
     """The way of a GPU: no number leaves it before the epoch's end."""
-    asked = questions(monkeypatch, ensemble.PolicyEnsemble, "training_step")
+    asked = record_synchronisations(monkeypatch, ensemble.PolicyEnsemble, "training_step")
     monkeypatch.setattr(ensemble, "_groups", lambda seeds, device: [slice(0, seeds)])
     train()
     assert asked == []
@@ -205,7 +205,7 @@ def test_dropout_keeps_the_mean() -> None:
 
 
 class Masked(nn.Module):
-    """Dropout(0.5) with given units dropped."""
+    """Applies Dropout(0.5) with given units dropped."""
 
     kept: torch.Tensor
 
@@ -214,13 +214,13 @@ class Masked(nn.Module):
 
 
 def unpacked(words: torch.Tensor, rows: int) -> torch.Tensor:
-    """Which units are kept, [rows, H], bit by bit with numpy."""
+    """Return which units are kept, [rows, H], bit by bit with numpy."""
     bits = [words.numpy().view(np.uint32) >> bit & 1 for bit in range(32)]
     return torch.from_numpy(1 - np.concatenate(bits).astype(np.float32)).view(rows, -1)
 
 
 def plain_fit(seed: int, z: np.ndarray, labels: pd.DataFrame, epochs: int) -> dict[str, nn.Sequential]:
-    """One policy by torch's layers, losses, autograd and Adam, with the chance of the stacked one."""
+    """Fit one policy with torch's layers, losses, autograd and Adam, and the random draws of the stacked one."""
     start = dict(initial_weights(seed))
     networks, masks = {}, {}
     for name, widths in WIDTHS.items():

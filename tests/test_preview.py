@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from drives import crossing_drive
 from study.config.settings import BirdviewSettings
 from study.data.birdview import Renderer
 from study.data.frames import open_frames, unpack_masks
 from study.data.preview import LIGHTS, choose_ego, label_text, sample, write_film, write_preview
 from study.episode.schema import RED
 from study.errors import BadInputError
+from tests.support.drives import crossing_drive
 
 VIEW = BirdviewSettings()
 

@@ -10,16 +10,16 @@ import pandas as pd
 import pytest
 from pypdf import PdfReader
 
-from simulated import DATASIZE_GRID, HEADS_GRID, World, simulate
 from study.config.grid import Grid
 from study.errors import BadInputError
 from study.report import __main__, build
 from study.report.build import build_report
 from study.report.summary import summarise
+from tests.support.synthetic_records import DATASIZE_GRID, HEADS_GRID, World, simulate
 
 
 def pages(pdf):
-    """Words of each page, with single blanks."""
+    """Return the words of each page, with single blanks."""
     return [" ".join(page.extract_text().split()) for page in PdfReader(pdf).pages]
 
 
@@ -67,7 +67,7 @@ def test_the_pdf_has_title_bookmarks_and_words_for_its_figures(built):
 
 
 def elements(node):
-    """A tagged PDF's structure elements below a node."""
+    """Yield a tagged PDF's structure elements below a node."""
     kids = node.get("/K", [])
     for kid in kids if isinstance(kids, list) else [kids]:
         found = kid.get_object() if hasattr(kid, "get_object") else kid
@@ -106,21 +106,31 @@ def test_a_complete_report_has_no_banner_and_names_its_simulator_and_design(buil
     assert "nothing about other encoders" in text
 
 
-def test_a_report_on_imported_drives_names_their_writer_and_not_our_town(tmp_path):
-    record = simulate(HEADS_GRID, World(epochs=6))
-    pdf = build_report(replace(record, data=record.data | {"writers": ["lab logger 3"]}), tmp_path)
-    text = pdf_text(pdf)
+@pytest.fixture(scope="module")
+def incomplete(built, tmp_path_factory):
+    """Write a report of less into a copy of the folder: cells are missing, and the drives were imported."""
+    folder = shutil.copytree(built[1], tmp_path_factory.mktemp("less") / "reports")
+    record = simulate(HEADS_GRID, World(epochs=12), unfinished=("rec+plan 100% e0",), failed=("full 100% e0",))
+    build_report(replace(record, data=record.data | {"writers": ["lab logger 3"]}), folder)
+    return folder
+
+
+def test_a_report_on_imported_drives_names_their_writer_and_not_our_town(incomplete):
+    text = pdf_text(incomplete / "heads.pdf")
     assert "imported drives, written by lab logger 3" in text
     assert "a town of our own" not in text
 
 
-def test_unfinished_and_failed_cells_are_named_on_the_first_page(tmp_path):
-    record = simulate(HEADS_GRID, World(epochs=12), unfinished=("rec+plan 100% e0",), failed=("full 100% e0",))
-    pdf = build_report(record, tmp_path)
-    first = pages(pdf)[0]
+def test_unfinished_and_failed_cells_are_named_on_the_first_page(incomplete):
+    first = pages(incomplete / "heads.pdf")[0]
     assert "Incomplete: 3 of 5 cells are finished" in first
     assert "Not finished: rec+plan 100% e0" in first
     assert re.search(r"Failed: full 100% e0 .*loss is nan", first)
+
+
+def test_a_report_of_less_removes_figures_of_more(built, incomplete):
+    assert (built[1] / "heads/figures/multi_results.svg").exists()
+    assert not (incomplete / "heads/figures/multi_results.svg").exists()
 
 
 def test_a_sweep_without_any_result_still_gives_a_report(tmp_path):
@@ -128,14 +138,6 @@ def test_a_sweep_without_any_result_still_gives_a_report(tmp_path):
     text = pdf_text(build_report(record, tmp_path))
     assert "0 of 5 cells" in text
     assert "No cell is finished" in text
-
-
-def test_a_report_of_less_removes_figures_of_more(tmp_path):
-    grid = Grid(name="heads", title="T", heads=("rec", "full"), policy_seeds=2)
-    build_report(simulate(grid, World(epochs=6)), tmp_path)
-    assert (tmp_path / "heads" / "figures" / "multi_results.svg").exists()
-    build_report(simulate(grid, World(epochs=6), unfinished=("full 100% e0",)), tmp_path)
-    assert not (tmp_path / "heads" / "figures" / "multi_results.svg").exists()
 
 
 @pytest.mark.parametrize(
@@ -170,7 +172,7 @@ def tracker(empty_store, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def committed(tracker):
-    """A record, and the sweep run that holds it."""
+    """Return a record, and the sweep run that holds it."""
     record = simulate(Grid(name="pair", title="T", heads=("rec", "full"), policy_seeds=3), World(epochs=6))
     run = tracker.open_sweep(
         record.grid, record.profile, record.settings, record.planned, record.data, record.provenance
@@ -184,8 +186,10 @@ def committed(tracker):
 
 def test_publish_builds_from_the_tracker_alone_and_logs_what_it_made(tracker, committed, tmp_path):
     record, run = committed
-    pdf = build.publish(tracker, "pair", None, tmp_path / "reports")
-    assert pdf.read_bytes() == build_report(record, tmp_path / "direct").read_bytes()
+    pdf = build.publish(tracker, "pair", None, tmp_path)
+    assert pdf.read_bytes().startswith(b"%PDF-")
+    numbers = json.loads((tmp_path / "pair/report.json").read_bytes())
+    assert numbers | {"figures": []} == json.loads(summarise(record).json())
     logged = {item.path for folder in ("report", "figures") for item in tracker.client.list_artifacts(run, folder)}
     assert {"report/pair.pdf", "report/report.json", "figures/test_compare_heads.svg"} <= logged
 

@@ -6,9 +6,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from simulated import simulate
 from study.errors import BadInputError
 from study.results.cell_result import ARRAYS, TABLE_COLUMNS, CellResult
+from tests.support.synthetic_records import simulate
 
 
 @pytest.fixture(scope="module")

@@ -38,7 +38,7 @@ def test_vehicles_are_on_the_road(drives, name):
 
 
 def _dense(line):
-    """Points of a polyline at most about a metre apart."""
+    """Return points of a polyline, at most about a metre apart."""
     parts = [np.linspace(a, b, int(np.hypot(*(b - a))) + 2) for a, b in pairwise(line)]
     return np.concatenate(parts)
 

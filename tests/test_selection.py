@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from drives import write_drives
 from study.config.settings import BirdviewSettings, FramesSettings
 from study.data.selection import LABELS, STANDING, candidates, choose, histograms, rake
 from study.episode.files import read_episode
 from study.errors import BadInputError
+from tests.support.drives import write_drives
 
 VIEW = BirdviewSettings()
 STEERING = np.array([0.1, 0.1, 0.1, 0.4, 0.1, 0.1, 0.1])
@@ -22,7 +22,7 @@ def drives(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def pool(drives):
-    """Candidates of ten drives for the policy set, half a second apart."""
+    """Return candidates of ten drives for the policy set, half a second apart."""
     return pool_of(drives, FramesSettings(spacing=0.5))
 
 

@@ -15,7 +15,7 @@ from study.sim.geometry import LENGTH
 
 @dataclass
 class Drive:
-    """What a town did: [steps, vehicles]."""
+    """Holds what the vehicles of a town did, [steps, vehicles] each."""
 
     acceleration: np.ndarray
     steering: np.ndarray
@@ -103,7 +103,7 @@ def test_traffic_flows_without_collisions(town: Drive) -> None:
 
 
 def crossing_pair(road: Traffic) -> tuple[int, int]:
-    """A left turn and a way straight on from across that it meets."""
+    """Return a left turn and the oncoming straight movement that it crosses."""
     town = road.town
     for a, left in enumerate(town.movements):
         for b, other in enumerate(town.movements):

@@ -6,13 +6,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from drives import write_drives
 from study.config.keys import FORMAT_VERSIONS
 from study.config.settings import BirdviewSettings, FramesSettings
 from study.data.selection import candidates
 from study.data.true_state import true_state
 from study.episode.files import episode_digest, read_episode
 from study.errors import BadInputError
+from tests.support.drives import write_drives
 
 COUNT = 3
 
@@ -26,7 +26,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def labels(folder):
-    """Candidate moments of all drives; the last drive is for testing."""
+    """Return candidate moments of all drives; the last drive is for testing."""
     settings = FramesSettings(spacing=0.3), BirdviewSettings()
     parts = [candidates(path, number, "policy", *settings) for number, path in enumerate(sorted(folder.iterdir()))]
     made = pd.concat([pd.DataFrame(part) for part in parts], ignore_index=True)
@@ -44,7 +44,7 @@ def state(labels, sources, folder):
 
 
 def linear(state, target):
-    """R2 of the best linear model of all frames."""
+    """Return R2 of the best linear model of all frames."""
     inside = np.column_stack([state, np.ones(len(state))]).astype(np.float64)
     error = target - inside @ np.linalg.lstsq(inside, target, rcond=None)[0]
     return 1 - (error**2).sum() / ((target - target.mean()) ** 2).sum()

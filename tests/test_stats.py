@@ -10,10 +10,10 @@ from scipy import stats as scipy_stats
 from sklearn import linear_model, preprocessing
 from statsmodels.stats.weightstats import DescrStatsW
 
-from simulated import DATASIZE_GRID, HEADS_GRID, Null, World, simulate
 from study.analysis import comparisons, convergence, intervals, learning_curves, predictions
 from study.results.cell_result import TABLE_COLUMNS
 from study.tracking.metrics import scores_of
+from tests.support.synthetic_records import DATASIZE_GRID, HEADS_GRID, Null, World, simulate
 
 PAIR = HEADS_GRID.model_copy(update={"heads": ("rec", "full")})
 DIFFERENCES = np.array([0.4, -0.1, 0.9, 0.3, 1.4, -0.6, 0.8, 0.2])
@@ -25,7 +25,7 @@ def record():
 
 
 def frame(values, encoders=1):
-    """A panel's frame of [seeds, epochs], the seeds shared out over encoders."""
+    """Return a panel's frame of [seeds, epochs], the seeds shared out over encoders."""
     values = np.asarray(values, float)
     index = pd.MultiIndex.from_product(
         [range(encoders), range(len(values) // encoders)], names=["encoder_seed", "policy_seed"]
@@ -371,7 +371,7 @@ def test_principal_components_are_those_of_the_covariance():
 
 
 def near(rate, nominal, draws):
-    """Whether a rate over so many draws is the nominal one, give or take three standard errors."""
+    """Return whether a rate over so many draws is within three standard errors of the nominal one."""
     return abs(rate - nominal) < 3 * math.sqrt(nominal * (1 - nominal) / draws)
 
 

@@ -4,9 +4,6 @@ import json
 import os
 import platform
 import shutil
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
@@ -14,6 +11,7 @@ from study.sweep.plan import make_plan
 from study.sweep.status import SILENT, cell_statuses, main, seconds_left
 from study.tracking.cell_run import Attempt
 from study.tracking.tracker import Tracker
+from tests.support.processes import ROOT, sweep
 
 NOW = 1_800_000_000.0
 PLAN = make_plan("heads", "laptop", {}, {})
@@ -73,16 +71,8 @@ def test_what_is_left_follows_what_was_measured_and_how_many_run():
 
 
 def test_where_nothing_was_tracked_all_cells_wait_and_nothing_is_made(tmp_path):
-    root = Path(__file__).parent.parent
-    (tmp_path / "sweeps").symlink_to(root / "sweeps")
-    done = subprocess.run(
-        [sys.executable, "-m", "study.sweep", "status", "heads"],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=True,
-        env=os.environ | {"PYTHONPATH": str(root)},
-    )
+    (tmp_path / "sweeps").symlink_to(ROOT / "sweeps")
+    done = sweep(tmp_path, "status", "heads")
     title, frames, *lines = done.stdout.splitlines()
     assert "0 of 5 cells finished, 5 waiting" in title
     assert "not made yet" in frames

@@ -1,4 +1,4 @@
-"""The whole way on the smoke profile: from an empty folder to the PDF."""
+"""A sweep of the smoke profile, from an empty folder to the PDF."""
 
 import json
 import re
@@ -9,10 +9,10 @@ from collections import Counter
 
 import pytest
 
-from running import FOUR, PLAN, ROOT, environment, store, sweep, working_folder
 from study.tracking.tracker import Tracker
-
-pytestmark = pytest.mark.slow
+from tests.support.processes import ROOT, sweep
+from tests.support.run_database import run_database
+from tests.support.sweeps import FOUR_CELLS, TINY_SWEEP, working_folder
 
 SMOKE = ("--profile", "smoke", "--threads", "1")
 SMALL = (*SMOKE, "--policy_seeds", "3")
@@ -21,7 +21,7 @@ TWO = ("--heads", "[rec,full]")
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A working folder in which `heads` has run with two head sets and the ceiling."""
+    """Return a working folder in which `heads` has run with two head sets and the ceiling."""
     made = working_folder(tmp_path_factory.mktemp("sweep"))
     done = sweep(made, "heads", *SMALL, *TWO)
     assert done.returncode == 0, done.stderr
@@ -43,11 +43,11 @@ def test_a_sweep_run_holds_the_data_card(folder):
 
 
 def test_the_same_command_again_trains_nothing(folder):
-    before = store(folder).cells()
+    before = run_database(folder).cell_counts()
     done = sweep(folder, "heads", *SMALL, *TWO, "--no-report")
     assert done.returncode == 0
     assert "3 of 3 cells finished" in done.stderr
-    assert store(folder).cells() == before
+    assert run_database(folder).cell_counts() == before
 
 
 def test_datasize_reuses_the_cells_of_heads(folder):
@@ -56,9 +56,10 @@ def test_datasize_reuses_the_cells_of_heads(folder):
     assert states == {"finished": 3, "waiting": 2}
 
 
-def test_a_failed_cell_leaves_the_others_is_told_and_runs_again_when_asked_for(quiet, tmp_path):
-    quiet.copy(tmp_path)
-    words = (*FOUR, "--heads", "[rec,rec+pred]", "--encoder.lr", "1e30", "--no-report")
+@pytest.mark.stress
+def test_a_failed_cell_leaves_the_others_is_told_and_runs_again_when_asked_for(undisturbed, tmp_path):
+    undisturbed.copy(tmp_path)
+    words = (*FOUR_CELLS, "--heads", "[rec,rec+pred]", "--encoder.lr", "1e30", "--no-report")
     for more, tries in ((), 2), ((), 2), (("--retry-failed",), 4):
         done = sweep(tmp_path, *words, *more)
         assert done.returncode == 1
@@ -66,23 +67,27 @@ def test_a_failed_cell_leaves_the_others_is_told_and_runs_again_when_asked_for(q
         assert "failed: rec+pred 100% e0" in done.stderr
         assert "epoch" in done.stderr
         assert " --retry-failed\n" in done.stderr
-        assert store(tmp_path).cells() == {"FAILED": tries}
+        assert run_database(tmp_path).cell_counts() == {"FAILED": tries}
 
 
+@pytest.mark.stress
 @pytest.mark.parametrize("workers", ["1", "4"])
-def test_one_and_four_workers_give_the_table_of_two(quiet, tmp_path, workers):
-    quiet.copy(tmp_path)
-    done = sweep(tmp_path, *FOUR, "--workers", workers, "--no-report")
+def test_one_and_four_workers_give_the_table_of_two(undisturbed, tmp_path, workers):
+    undisturbed.copy(tmp_path)
+    done = sweep(tmp_path, *FOUR_CELLS, "--workers", workers, "--no-report")
     assert done.returncode == 0, done.stderr
-    assert table(tmp_path).to_csv() == table(quiet.folder).to_csv()
+    assert table(tmp_path).to_csv() == table(undisturbed.folder).to_csv()
 
 
-def test_a_finished_cell_computed_again_has_the_same_bytes(quiet):
+@pytest.mark.stress
+def test_a_finished_cell_computed_again_has_the_same_bytes(undisturbed):
     def kept():
-        return store(quiet.folder).cells(), {path.name for path in (quiet.folder / "data").iterdir()}
+        return run_database(undisturbed.folder).cell_counts(), {
+            path.name for path in (undisturbed.folder / "data").iterdir()
+        }
 
     before = kept()
-    done = sweep(quiet.folder, "verify", *PLAN, "--ceiling", "false")
+    done = sweep(undisturbed.folder, "verify", *TINY_SWEEP, "--ceiling", "false")
     assert done.returncode == 0, done.stdout + done.stderr
     assert "equal: curves, weights, samples and predictions, byte for byte" in done.stdout
     assert kept() == before
@@ -96,6 +101,7 @@ def test_a_result_tells_what_made_it(folder):
     assert told["provenance"]["seeds"]["policies"] == [0, 1, 2]
 
 
+@pytest.mark.stress
 def test_encoders_that_differ_by_their_seed_alone_show_no_effect(folder, tmp_path):
     """The real null study: four encoders of rec pose as the four head sets, in each of the 24 orders."""
     for name in ("sweeps", "data/episodes", "data/frames"):
@@ -104,7 +110,7 @@ def test_encoders_that_differ_by_their_seed_alone_show_no_effect(folder, tmp_pat
     done = sweep(tmp_path, *words, "--workers", "2")
     assert done.returncode == 0, done.stderr
     words = [sys.executable, ROOT / "benchmarks/null_study.py", "heads", "--profile", "smoke"]
-    told = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=True, env=environment()).stdout
+    told = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=True).stdout
     outcomes = set(re.findall(r"^(H\d) ([a-z ]+): \d+$", told, re.MULTILINE))
     assert {claim for claim, _ in outcomes} == {"H1", "H2", "H3", "H4", "H5"}
     assert {claim for claim, outcome in outcomes if outcome == "reproduced"} <= {"H1"}  # which says: no effect

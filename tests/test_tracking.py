@@ -17,13 +17,13 @@ import pandas as pd
 import pytest
 from mlflow.artifacts import download_artifacts
 
-from servers import free_port
 from study.config.grid import Cell, Grid
 from study.config.settings import StudySettings
 from study.errors import BadInputError, masked
 from study.results.cell_result import ARRAYS, CellResult
 from study.tracking.store import SQLITE, TrackerLostError
 from study.tracking.tracker import Tracker
+from tests.support.servers import TrackingServer, free_port
 
 EPOCHS, SEEDS = 6, 3
 SETTINGS = StudySettings()
@@ -77,7 +77,7 @@ def uri(empty_store, tmp_path_factory):
 
 @pytest.fixture
 def tracker(uri, request):
-    """An experiment of its own in the one store."""
+    """Return a tracker with an experiment of its own in the shared store."""
     return Tracker(uri, experiment=request.node.name)
 
 
@@ -250,7 +250,7 @@ def test_a_result_of_another_cell_is_refused(tracker):
 
 @pytest.fixture
 def network():
-    """Stands for an exported network; the tracker does not look inside."""
+    """Return bytes in place of an exported network; the tracker does not look inside."""
     return b"a graph and its weights"
 
 
@@ -629,15 +629,23 @@ def test_credentials_are_hidden():
 
 def test_a_normal_use_prints_nothing(uri):
     code = f"from study.tracking.tracker import Tracker; print(Tracker({uri!r}).finished(['x']), end='')"
-    root = Path(__file__).parent.parent
-    done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert (done.stdout, done.stderr) == ("{}", "")
 
 
 # --- a server -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.fixture
+def tracking_server(tmp_path, empty_store):
+    (tmp_path / "tracking").mkdir()
+    shutil.copy(empty_store, tmp_path / "tracking")
+    server = TrackingServer(tmp_path / "tracking")
+    yield server
+    server.stop()
+
+
+@pytest.mark.stress
 def test_a_server_lost_in_the_middle_is_one_clear_error_and_nothing_is_doubled_after(tracking_server, monkeypatch):
     monkeypatch.setenv("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")
     tracker = Tracker(tracking_server.uri)

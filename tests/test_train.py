@@ -2,6 +2,7 @@
 
 import fcntl
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -10,14 +11,15 @@ from pathlib import Path
 import pytest
 
 from study.console.options import Parser
+from study.data.__main__ import main as record_drives
 from study.errors import EXIT_AGAIN, EXIT_FAILED, BadInputError
 from study.results.cell_result import load_results
 from study.sweep.options import add_plan_options
 from study.sweep.plan import given_plan
 from study.sweep.train import main
 from study.tracking.tracker import Tracker
+from tests.support.processes import ROOT
 
-ROOT = Path(__file__).parent.parent
 SWEEP = ["heads", "--heads", "[rec,full]", "--policy_seeds", "2"]
 SETTINGS = [
     *("--profile", "smoke", "--town.vehicles", "30", "--recording.warm_up", "1", "--recording.duration", "4"),
@@ -51,59 +53,15 @@ def plan(words=PLAN):
     return given_plan(parser.parse(words))
 
 
-def script(at, *words, **environment):
-    """A step of benchmarks/paper_scale.sh, from the code in `at`."""
-    done = subprocess.run(
-        ["bash", str(at / "benchmarks" / "paper_scale.sh"), *words],
-        env=os.environ | {"PYTHON": sys.executable, **environment},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stderr
-
-
 @pytest.fixture(scope="module")
 def home(tmp_path_factory):
-    """What travels to the GPU machine: the last commit's code, and drives."""
-    made = tmp_path_factory.mktemp("train") / "packed"
-    script(ROOT, "pack", str(made), *SETTINGS, SWEEP=" ".join(SWEEP), WHEELS="")
-    before = Path.cwd()
-    os.chdir(made)
-    yield made
+    """Enter a working folder with drives."""
+    folder, before = tmp_path_factory.mktemp("home"), Path.cwd()
+    shutil.copytree(ROOT / "sweeps", folder / "sweeps")
+    os.chdir(folder)
+    assert record_drives(["record", *SETTINGS]) == 0
+    yield folder
     os.chdir(before)
-
-
-@pytest.fixture(scope="module")
-def results(home):
-    """Results of processes that have no tracker, no engine but their own process, and no simulator."""
-    refusal = home.with_name("refusal")
-    refusal.mkdir()
-    (refusal / "sitecustomize.py").write_text(REFUSAL)
-    script(home, "train", PYTHONPATH=str(refusal))
-    return home / "results"
-
-
-@pytest.mark.slow
-def test_cells_are_trained_where_tracker_dask_and_simulator_are_missing(results):
-    assert {result.key: result.cell for result in load_results(results)} == plan().cells
-
-
-@pytest.mark.slow
-def test_they_are_imported_to_the_report_where_they_come_back(home, results):
-    said = script(ROOT, "import", str(home))
-    assert said.count(": imported") == len(plan().cells)
-    assert (home / "reports/heads.pdf").read_bytes().startswith(b"%PDF")
-    commit = subprocess.run(["git", "-C", str(ROOT), "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
-    record = Tracker().read_sweep("heads")
-    assert {result.facts["provenance"]["commit"] for result in record.results.values()} == {commit.stdout.strip()}
-
-
-def test_a_cell_that_is_there_is_not_trained_again(results):
-    before = {path: path.stat().st_mtime_ns for path in results.rglob("*")}
-    assert main([*PLAN, "--out", str(results)]) == 0
-    assert {path: path.stat().st_mtime_ns for path in results.rglob("*")} == before
 
 
 def test_the_limit_ends_a_piece_and_says_that_cells_are_left(home, tmp_path):
@@ -158,3 +116,61 @@ def test_a_library_that_is_missing_is_told_before_the_data_is_made(home, tmp_pat
 def test_what_cannot_be_used_is_told(home, tmp_path, words, said):
     with pytest.raises(BadInputError, match=said):
         main([*PLAN, "--out", str(tmp_path), *words])
+
+
+# --- on another machine ---------------------------------------------------------------------------------------------
+
+
+def script(code, *words, cwd=None, **environment):
+    """Run a step of benchmarks/paper_scale.sh, of the code in a folder, and return what it says."""
+    done = subprocess.run(
+        ["bash", str(code / "benchmarks" / "paper_scale.sh"), *words],
+        cwd=cwd,
+        env=os.environ | {"PYTHON": sys.executable, **environment},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stderr
+
+
+@pytest.fixture(scope="module")
+def packed(tmp_path_factory):
+    """Pack what travels to the GPU machine: the last commit's code, and drives."""
+    folder = tmp_path_factory.mktemp("train") / "packed"
+    script(ROOT, "pack", str(folder), *SETTINGS, SWEEP=" ".join(SWEEP), WHEELS="")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def results(packed):
+    """Return results of processes without tracker and simulator, whose only engine is their own process."""
+    refusal = packed.with_name("refusal")
+    refusal.mkdir()
+    (refusal / "sitecustomize.py").write_text(REFUSAL)
+    script(packed, "train", PYTHONPATH=str(refusal))
+    return packed / "results"
+
+
+@pytest.mark.stress
+def test_cells_are_trained_where_tracker_dask_and_simulator_are_missing(results):
+    assert {result.key: result.cell for result in load_results(results)} == plan().cells
+
+
+@pytest.mark.stress
+def test_cells_come_back_into_mlflow_and_the_report_with_the_commit_that_trained_them(packed, results):
+    output = script(ROOT, "import", str(packed), cwd=packed)
+    assert output.count(": imported") == len(plan().cells)
+    assert (packed / "reports/heads.pdf").read_bytes().startswith(b"%PDF")
+    commit = subprocess.run(["git", "-C", str(ROOT), "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
+    record = Tracker(f"sqlite:///{packed}/mlruns/mlflow.db").read_sweep("heads")
+    assert {result.facts["provenance"]["commit"] for result in record.results.values()} == {commit.stdout.strip()}
+
+
+@pytest.mark.stress
+def test_a_finished_cell_is_not_trained_again(packed, results, monkeypatch):
+    monkeypatch.chdir(packed)
+    before = {path: path.stat().st_mtime_ns for path in results.rglob("*")}
+    assert main([*PLAN, "--out", str(results)]) == 0
+    assert {path: path.stat().st_mtime_ns for path in results.rglob("*")} == before

@@ -1,11 +1,9 @@
 """Optuna says which cell is next: each of the plan's once and in order, whatever an earlier process has left."""
 
-import os
 import signal
 import subprocess
 import sys
 from collections import Counter
-from pathlib import Path
 
 import optuna
 import pytest
@@ -27,7 +25,7 @@ def start(file, order=tuple(LABELS), labels=LABELS):
 
 
 def listed(file):
-    """All trials that Optuna knows."""
+    """Return all trials that Optuna knows."""
     return optuna.load_study(study_name=STUDY, storage=f"sqlite:///{file}").get_trials()
 
 
@@ -86,8 +84,7 @@ os.kill(os.getpid(), signal.SIGKILL)
 
 
 def test_what_a_killed_process_left_is_closed_by_the_next(file):
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent.parent)}
-    done = subprocess.run([sys.executable, "-c", KILLED, file, STUDY], env=environment, check=False)
+    done = subprocess.run([sys.executable, "-c", KILLED, file, STUDY], check=False)
     assert done.returncode == -signal.SIGKILL
     assert states(file) == {"RUNNING": 1, "WAITING": 2}
     trials = start(file, ["k3", "k1"])

@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from simulated import simulate
 from study.errors import BadInputError
 from study.sweep.verify import changes, choose, differences, judge, report
+from tests.support.synthetic_records import simulate
 
 RECORD = simulate()
 RESULT = next(iter(RECORD.results.values()))

@@ -1,4 +1,4 @@
-"""Sweep records drawn from known effects: real values of the real types, without any training."""
+"""Draws sweep records from known effects: real values of the real types, without any training."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FRAMES, EPISODES, SAMPLES = 600, 15, 16
 
 @dataclass(frozen=True)
 class World:
-    """What is true of the simulated study: accuracies and time constants by head set, noise by level."""
+    """Holds the true effects of a study: accuracies and time constants by head set, noise by level."""
 
     accuracy: dict[str, float] = field(
         default_factory=lambda: {"rec": 0.815, "rec+pred": 0.838, "rec+plan": 0.862, "full": 0.886}
@@ -67,7 +67,7 @@ STEERING_FLOOR = 0.00482  # loss of the best constant command there
 
 @dataclass(frozen=True)
 class Null:
-    """Spread of a copy of rec, as sd of accuracy unless said so; for policies and epochs the laptop profile's.
+    """Holds the spread of copies of rec, as sd of accuracy unless stated; defaults are the laptop profile's.
 
     A policy's deviation is its start, gone after a few epochs; a slow wander (correlation 0.95 from epoch to epoch);
     and noise of each epoch. Steering losses go with their policy seed in all cells (r = 0.8), accuracies do not (0.0).
@@ -86,12 +86,12 @@ class Null:
     fast: bool = False
 
     def mean_curve(self):
-        """Accuracy by epoch without any spread."""
+        """Return accuracy by epoch without any spread."""
         curve = FAST_ACCURACY if self.fast else REC_ACCURACY
         return np.interp(np.log(np.arange(1, self.epochs + 1)), np.log(REC_EPOCHS), curve)
 
     def evidence(self, grid, seed):
-        """What `study.analysis.claims` looks at, of a study of that grid."""
+        """Return the evidence that `study.analysis.claims` weighs, for a study of that grid."""
         rng = np.random.default_rng(seed)
         epoch = np.arange(1, self.epochs + 1)
         mean, loss = self.mean_curve(), np.interp(np.log(epoch), np.log(REC_EPOCHS), REC_STEERING)
@@ -123,7 +123,7 @@ class Null:
 
 
 def _rows(seeds, stage, split, metric, values):
-    """Tidy rows of values [S, E]."""
+    """Return tidy rows of values [S, E]."""
     count, epochs = values.shape
     return pd.DataFrame(
         {
@@ -138,7 +138,7 @@ def _rows(seeds, stage, split, metric, values):
 
 
 def policy_curves(cell, world, seeds, rng):
-    """Accuracy and steering loss by epoch on both splits, [S, E] each."""
+    """Return accuracy and steering loss by epoch on both splits, [S, E] each."""
     halvings = -np.log2(cell.fraction) * (1.0 if cell.heads == "rec" else 0.5)
     final = (
         world.accuracy.get(cell.heads, world.ceiling) - world.by_fraction * halvings + rng.normal(0, world.encoder_sd)
@@ -165,7 +165,7 @@ def policy_curves(cell, world, seeds, rng):
 
 
 def simulate_cell(cell, key, settings, world, seeds, rng, labels):
-    """A whole result: curves, pictures, predictions whose accuracy is the last epoch's."""
+    """Return a complete result: curves, pictures, predictions whose accuracy is the last epoch's."""
     curves = policy_curves(cell, world, seeds, rng)
     parts = [_rows(np.arange(seeds), "policy", split, metric, values) for (split, metric), values in curves.items()]
     heads = HEAD_SETS.get(cell.heads, ())  # the ceiling has no encoder
@@ -219,7 +219,7 @@ def simulate_cell(cell, key, settings, world, seeds, rng, labels):
 
 
 def _encoder():
-    """Weights of an encoder that gives zero for all it sees."""
+    """Return weights of an encoder that maps every image to zero."""
     weights = {"mean.weight": (LATENT, CHANNELS[-1] * CORE * CORE), "mean.bias": (LATENT,)}
     for number, (before, after) in enumerate(itertools.pairwise((3, *CHANNELS))):
         layer = f"convolutions.{3 * number}"
@@ -231,7 +231,7 @@ def _encoder():
 
 
 def _policies(seeds):
-    """Weights of policies that say zero, whatever z is."""
+    """Return weights of policies that answer zero for every z."""
     weights = {
         "z_mean": np.zeros(LATENT, np.float32),
         "z_std": np.ones(LATENT, np.float32),
@@ -245,7 +245,7 @@ def _policies(seeds):
 
 
 def _pictures(rng):
-    """Bird views of a kind: road, lane line, route, cars."""
+    """Draw simple bird views: road, lane line, route, cars."""
     images = np.zeros((SAMPLES, 64, 64, 3), np.uint8)
     for image in images:
         left = int(rng.integers(18, 30))
@@ -259,7 +259,7 @@ def _pictures(rng):
 
 
 def simulate(grid=HEADS_GRID, world=None, seed=0, settings=None, unfinished=(), failed=()):
-    """A record of a sweep. `unfinished` and `failed` are labels of cells without a result."""
+    """Return the record of a sweep. `unfinished` and `failed` are labels of cells without a result."""
     world = world or World()
     settings = settings or StudySettings()
     rng = np.random.default_rng(seed)
@@ -297,7 +297,7 @@ def simulate(grid=HEADS_GRID, world=None, seed=0, settings=None, unfinished=(), 
 
 
 def manifest():
-    """What the report reads of a frame store's manifest."""
+    """Return the part of a frame store's manifest that the report reads."""
 
     def labels(frames, drives, classes, near_zero):
         rest = (frames - near_zero) // 6

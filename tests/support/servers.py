@@ -1,26 +1,23 @@
-"""Real servers for tests, on loopback only: MLflow's tracking server, which can be stopped and started again."""
+"""Runs MLflow's tracking server on loopback; it can be stopped and started again."""
 
 from __future__ import annotations
 
 import http.client
 import os
-import shutil
 import signal
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-
-import pytest
 
 LOOPBACK = "127.0.0.1"
 PATIENCE = 300.0  # [s] for a server to answer; MLflow makes its tables first, and a busy machine is slow
 
 
 def free_port() -> int:
-    """A port that nobody listens on."""
+    """Return a port that nobody listens on."""
     with socket.socket() as probe:
         probe.bind((LOOPBACK, 0))
         return int(probe.getsockname()[1])
@@ -40,7 +37,7 @@ def _await(process: subprocess.Popen[bytes], answers: Callable[[], bool], log: P
 
 
 class TrackingServer:
-    """An MLflow server with its store in `folder`, or in the database `store`; artifacts go through it."""
+    """Runs an MLflow server with its store in `folder`, or in the database `store`; artifacts go through it."""
 
     def __init__(self, folder: Path, store: str | None = None, port: int | None = None) -> None:
         self.port = port or free_port()
@@ -94,13 +91,3 @@ class TrackingServer:
                 os.killpg(self._process.pid, signal.SIGKILL)
                 self._process.wait()
             self._process = None
-
-
-@pytest.fixture
-def tracking_server(tmp_path: Path, empty_store: Path) -> Iterator[TrackingServer]:
-    """An MLflow server of its own on SQLite."""
-    (tmp_path / "tracking").mkdir()
-    shutil.copy(empty_store, tmp_path / "tracking")
-    server = TrackingServer(tmp_path / "tracking")
-    yield server
-    server.stop()

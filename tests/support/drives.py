@@ -1,4 +1,4 @@
-"""Small real Episodes for tests, built with numpy alone: four roads, one crossing with lights, cars that drive routes.
+"""Makes small real Episodes with numpy alone: four roads, one crossing with lights, cars that drive routes.
 
 The world: roads along x and y meet at the origin, one lane each way, right-hand traffic. Cars come in from each arm,
 stop at red and yellow lights and behind their leader, and go straight, left or right. Everything that an Episode can
@@ -26,14 +26,14 @@ Points = NDArray[np.float64]
 
 
 def turned(points: Points, quarters: int) -> Points:
-    """Points [.., 2] turned anticlockwise about the origin by quarter turns."""
+    """Turn points [.., 2] anticlockwise about the origin by quarter turns."""
     angle = np.pi / 2 * quarters
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     return np.asarray(points @ turn.T)
 
 
 def _way(turn: str) -> tuple[Points, Points, Points]:
-    """Approach from the west, way through the crossing, way out; every half metre."""
+    """Return the approach from the west, the way through the crossing and the way out, every half metre."""
     y = -LANE / 2
     approach = np.stack([np.arange(-CORNER - ARM, -CORNER + 0.25, 0.5), np.full(int(ARM * 2) + 1, y)], axis=1)
     if turn == "straight":
@@ -49,7 +49,7 @@ def _way(turn: str) -> tuple[Points, Points, Points]:
 
 
 def crossing_lanes() -> tuple[Lane, ...]:
-    """The map: approach, exit and three ways through for each arm."""
+    """Return the map: approach, exit and three ways through for each arm."""
     lanes = []
     for arm in range(4):
         for kind, turn in enumerate(("straight", "left", "right")):
@@ -62,13 +62,13 @@ def crossing_lanes() -> tuple[Lane, ...]:
 
 
 def crossing_lights() -> tuple[Light, ...]:
-    """One light at the end of each approach."""
+    """Return one light at the end of each approach."""
     line = np.array([[-CORNER, -LANE], [-CORNER, 0.0]])
     return tuple(Light(arm, turned(line, arm), lane=10 * arm) for arm in range(4))
 
 
 def crossing_drive(seed: int = 0, cars: int = 12, steps: int = 80, name: str | None = None) -> Episode:
-    """An Episode of `steps` at 10 Hz with `cars` at the crossing. Every car may be ego and is there all the time."""
+    """Return an Episode of `steps` at 10 Hz with `cars` at the crossing, each of which may be ego and never leaves."""
     rng = np.random.default_rng([seed, 7])
     clock = np.arange(steps) + int(rng.integers(4 * CYCLE))
     green_arm, phase = clock // CYCLE % 4, clock % CYCLE
