@@ -182,7 +182,7 @@ def measure_tracking(plan: Plan, result: CellResult, network: bytes) -> Numbers:
 
 def count_work(plan: Plan) -> Numbers:
     """Tasks, reports and cells of a sweep, and the seconds that its stages are expected to take."""
-    from study.tracking.cell_run import FLUSH, SIGN  # noqa: PLC0415 - as above
+    from study.tracking.cell_run import FLUSH, HEARTBEAT  # noqa: PLC0415 - as above
 
     recording = plan.settings.recording
     drives = recording.encoder_episodes + recording.policy_episodes
@@ -198,7 +198,7 @@ def count_work(plan: Plan) -> Numbers:
         "tasks": 3 * drives + 1 + 3 * len(plan.cells) + int(sum(shares.values())),
         "shares": int(sum(shares.values())),
         # On one core each takes twice as long.
-        "live_writes": int(2 * encoders / SIGN + 2 * policies / FLUSH),
+        "live_writes": int(2 * encoders / HEARTBEAT + 2 * policies / FLUSH),
         "reports": int(2 * encoders / REPORT_EVERY + 2 * plan.settings.policy.epochs * sum(shares.values())),
         "expected_s": expected,
     }

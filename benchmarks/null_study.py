@@ -40,7 +40,7 @@ def main() -> None:
     parser.add_argument("--tracking", default=DEFAULT_TRACKING)
     parser.add_argument("--heads", default="rec", help="whose encoders pose (default: rec)")
     options = parser.parse_args()
-    record = Tracker(options.tracking).read_sweep(options.sweep, options.profile)
+    record = Tracker(options.tracking).reader.read_sweep(options.sweep, options.profile)
     point, table = (options.heads, max(record.grid.fractions)), record.table()
     accuracy, steering = (
         learning_curves.panel(table, metric)[point] for metric in (learning_curves.ACCURACY, learning_curves.STEERING)

@@ -40,7 +40,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 from study.config.settings import BirdviewSettings, FramesSettings  # noqa: E402
 from study.data.build import frames_flow  # noqa: E402
 from study.engine.flows import run_flow  # noqa: E402
-from study.tracking.store import SQLITE, open_store  # noqa: E402
+from study.tracking.experiment import create_database  # noqa: E402
 from tests.support.drives import write_drives  # noqa: E402
 from tests.support.sweeps import UndisturbedSweep  # noqa: E402
 
@@ -81,7 +81,7 @@ def small_store(small_drives: list[Path], tmp_path_factory: pytest.TempPathFacto
 def empty_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a database file with MLflow's empty tables: making them takes seconds, copying the file nothing."""
     path = tmp_path_factory.mktemp("empty") / "mlflow.db"
-    open_store(f"{SQLITE}{path}")
+    create_database(path)
     return path
 
 

@@ -88,7 +88,7 @@ def test_an_import_that_was_stopped_goes_on_and_commits_every_cell_once(here, pl
         assert main([*PLAN, "--import-results", str(folder)]) == 0
         assert run_database(here).cell_counts() == {"FINISHED": 2, "KILLED": 1}
 
-    record = Tracker().read_sweep("heads")
+    record = Tracker().reader.read_sweep("heads")
     assert record.complete
     assert record.data["key"] == plan.frames.name
     assert {result.facts["device"] for result in record.results.values()} == {DEVICE}

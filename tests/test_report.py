@@ -195,6 +195,8 @@ def test_publish_builds_from_the_tracker_alone_and_logs_what_it_made(tracker, co
 
 
 def test_a_sweep_that_varies_one_setting_is_found_and_takes_nobodys_place(tracker, committed, capsys):
+    from study.tracking.variants import read_variants
+
     record = committed[0]
     settings = record.settings.model_copy(
         update={"frames": record.settings.frames.model_copy(update={"split": "frame"})}
@@ -206,23 +208,23 @@ def test_a_sweep_that_varies_one_setting_is_found_and_takes_nobodys_place(tracke
         new = f"v{key[1:]}"
         tracker.commit(tracker.start_cell(run, planned[new], new, settings, 3), replace(result, key=new))
     tracker.close_sweep(run, "FINISHED")
-    assert {name: one.grid.name for name, one in tracker.read_variants(record).items()} == {
+    assert {name: one.grid.name for name, one in read_variants(tracker.reader, record).items()} == {
         "frames.split": "pair-split"
     }
-    back = tracker.read_variants(tracker.read_sweep("pair-split"))
+    back = read_variants(tracker.reader, tracker.reader.read_sweep("pair-split"))
     assert {name: one.grid.name for name, one in back.items()} == {"frames.split": "pair"}
-    assert tracker.read_sweep("pair").settings == record.settings
-    assert __main__.main(["pair", "--format", "md", "--tracking", tracker.uri]) == 0
+    assert tracker.reader.read_sweep("pair").settings == record.settings
+    assert __main__.main(["pair", "--format", "md", "--tracking", tracker.experiment.uri]) == 0
     assert "`frames.split`: episode here, frame in `pair-split`" in capsys.readouterr().out
 
 
 def test_compare_takes_files_folders_and_sweeps_in_mlflow(tracker, committed, tmp_path, capsys):
     (tmp_path / "report.json").write_bytes(summarise(committed[0]).json())
-    for other in (tmp_path / "report.json", f"pair@{tracker.uri}", f"pair:laptop@{tracker.uri}"):
+    for other in (tmp_path / "report.json", f"pair@{tracker.experiment.uri}", f"pair:laptop@{tracker.experiment.uri}"):
         assert __main__.main(["compare", str(tmp_path), str(other)]) == 0
         assert "rec (the same result), full (the same result)" in capsys.readouterr().out
     with pytest.raises(BadInputError, match=r"no sweep 'pair \(paper\)'"):
-        __main__.main(["compare", str(tmp_path), "pair:paper", "--tracking", tracker.uri])
+        __main__.main(["compare", str(tmp_path), "pair:paper", "--tracking", tracker.experiment.uri])
     with pytest.raises(BadInputError, match=r"cannot read nowhere/report\.json"):
         __main__.main(["compare", str(tmp_path), "nowhere/report.json"])
     with pytest.raises(BadInputError, match="compare A B"):
@@ -263,7 +265,7 @@ def test_a_figure_that_cannot_be_is_refused_before_anything_is_read(words, messa
 
 def test_format_md_prints_tables_and_writes_nothing(tracker, committed, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert __main__.main(["pair", "--format", "md", "--tracking", tracker.uri]) == 0
+    assert __main__.main(["pair", "--format", "md", "--tracking", tracker.experiment.uri]) == 0
     assert "| full | 3 |" in capsys.readouterr().out
     assert list(tmp_path.iterdir()) == []
 
@@ -274,7 +276,7 @@ def test_a_sweep_that_was_never_run_is_bad_input(tracker, tmp_path):
 
 
 def test_the_command_says_what_is_wrong_and_exits_with_2(tracker):
-    command = [sys.executable, "-m", "study.report", "nosuch", "--tracking", tracker.uri]
+    command = [sys.executable, "-m", "study.report", "nosuch", "--tracking", tracker.experiment.uri]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert "no sweep 'nosuch'" in done.stderr

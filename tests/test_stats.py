@@ -12,7 +12,7 @@ from statsmodels.stats.weightstats import DescrStatsW
 
 from study.analysis import comparisons, convergence, intervals, learning_curves, predictions
 from study.results.cell_result import TABLE_COLUMNS
-from study.tracking.metrics import scores_of
+from study.tracking.metrics import final_scores
 from tests.support.synthetic_records import DATASIZE_GRID, HEADS_GRID, Null, World, simulate
 
 PAIR = HEADS_GRID.model_copy(update={"heads": ("rec", "full")})
@@ -38,7 +38,7 @@ def frame(values, encoders=1):
 
 def test_final_scores_are_means_of_the_last_epochs_of_each_seed(record):
     table = record.table()
-    scores = {key: scores_of(result) for key, result in record.results.items()}
+    scores = {key: final_scores(result) for key, result in record.results.items()}
     (full,) = (scores[key] for key, cell in record.planned.items() if cell.heads == "full")
     one = table[
         (table["heads"] == "full")

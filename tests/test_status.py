@@ -9,7 +9,7 @@ import pytest
 
 from study.sweep.plan import make_plan
 from study.sweep.status import SILENT, cell_statuses, main, seconds_left
-from study.tracking.cell_run import Attempt
+from study.tracking.reader import Attempt
 from study.tracking.tracker import Tracker
 from tests.support.processes import ROOT, sweep
 

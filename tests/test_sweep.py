@@ -29,7 +29,7 @@ def folder(tmp_path_factory):
 
 
 def table(folder):
-    return Tracker(f"sqlite:///{folder}/mlruns/mlflow.db").read_sweep("heads").table()
+    return Tracker(f"sqlite:///{folder}/mlruns/mlflow.db").reader.read_sweep("heads").table()
 
 
 def test_a_sweep_ends_with_its_report(folder):
@@ -95,7 +95,7 @@ def test_a_finished_cell_computed_again_has_the_same_bytes(undisturbed):
 
 def test_a_result_tells_what_made_it(folder):
     tracker = Tracker(f"sqlite:///{folder}/mlruns/mlflow.db")
-    told = next(iter(tracker.read_sweep("heads").results.values())).facts
+    told = next(iter(tracker.reader.read_sweep("heads").results.values())).facts
     assert told["threads"] == 1
     assert told["provenance"]["determinism"].keys() >= {"deterministic_algorithms", "cudnn_benchmark", "matmul_tf32"}
     assert told["provenance"]["seeds"]["policies"] == [0, 1, 2]

@@ -21,7 +21,8 @@ from study.config.grid import Cell, Grid
 from study.config.settings import StudySettings
 from study.errors import BadInputError, masked
 from study.results.cell_result import ARRAYS, CellResult
-from study.tracking.store import SQLITE, TrackerLostError
+from study.tracking.experiment import SQLITE, TrackerLostError
+from study.tracking.reader import Reader
 from study.tracking.tracker import Tracker
 from tests.support.servers import TrackingServer, free_port
 
@@ -95,7 +96,9 @@ def train(tracker, sweep, planned, key, seed=0):
 
 def children(tracker, run_id):
     return [
-        run for run in tracker._search(f"tags.`mlflow.parentRunId` = '{run_id}'") if run.data.tags["kind"] == "seed"
+        run
+        for run in tracker.experiment.search(f"tags.`mlflow.parentRunId` = '{run_id}'")
+        if run.data.tags["kind"] == "seed"
     ]
 
 
@@ -129,17 +132,17 @@ def assert_same_result(left, right):
 def test_a_committed_result_comes_back_as_it_was(tracker):
     planned = cells("back")
     run_id = train(tracker, open_sweep(tracker, planned), planned, "back-0")
-    assert_same_result(tracker.load_result(run_id), make_result(planned["back-0"], "back-0"))
+    assert_same_result(tracker.reader.load_result(run_id), make_result(planned["back-0"], "back-0"))
 
 
 def test_a_cell_is_finished_by_its_commit_only(tracker):
     planned = cells("only")
     sweep = open_sweep(tracker, planned)
     run = start(tracker, sweep, planned, "only-0")
-    assert tracker.finished(planned) == {}
+    assert tracker.reader.finished(planned) == {}
     assert tracker.commit(run, make_result(planned["only-0"], "only-0")) == run.run_id
-    assert tracker.finished(planned) == {"only-0": run.run_id}
-    assert tracker.finished(["other"]) == {}
+    assert tracker.reader.finished(planned) == {"only-0": run.run_id}
+    assert tracker.reader.finished(["other"]) == {}
 
 
 def test_live_points_appear_while_training_and_are_there_once_at_the_end(tracker):
@@ -225,6 +228,7 @@ def test_a_list_of_runs_reads_well(tracker):
     assert run.data.metrics["seconds/encoder"] == 1.5
     assert run.data.tags["mlflow.source.git.commit"] == "c" * 40
     assert run.data.tags["device"] == "cpu"
+    assert run.data.tags["mlflow.runColor"] == "#D55E00"
     assert run.inputs.dataset_inputs[0].dataset.digest == DATA["key"]
     assert "mlflow.user" not in run.data.tags
 
@@ -232,10 +236,10 @@ def test_a_list_of_runs_reads_well(tracker):
 def test_the_view_of_all_cells_shows_columns_that_there_are(tracker):
     planned = cells("view")
     run = tracker.client.get_run(train(tracker, open_sweep(tracker, planned), planned, "view-0"))
-    view = json.loads(tracker.client.get_experiment(tracker.experiment).tags["mlflow.sharedViewState.cells"])
+    view = json.loads(tracker.client.get_experiment(tracker.experiment.id).tags["mlflow.sharedViewState.cells"])
     there = {f"{kind}.`{name}`" for kind in ("params", "metrics", "tags") for name in getattr(run.data, kind)}
     assert set(view["selectedColumns"]) <= there
-    assert [found.info.run_id for found in tracker._search(view["searchFilter"])] == [run.info.run_id]
+    assert [found.info.run_id for found in tracker.experiment.search(view["searchFilter"])] == [run.info.run_id]
 
 
 def test_a_result_of_another_cell_is_refused(tracker):
@@ -255,7 +259,7 @@ def network():
 
 
 def models(tracker):
-    return list(tracker.client.search_logged_models([tracker.experiment]))
+    return list(tracker.client.search_logged_models([tracker.experiment.id]))
 
 
 def network_at(tracker, address):
@@ -294,7 +298,7 @@ def test_an_attempt_that_was_killed_leaves_no_model(tracker):
     planned = cells("pending")
     sweep = open_sweep(tracker, planned)
     killed = start(tracker, sweep, planned, "pending-0")
-    tracker.client.create_logged_model(tracker.experiment, "driver", killed.run_id)  # where the upload was cut off
+    tracker.client.create_logged_model(tracker.experiment.id, "driver", killed.run_id)  # where the upload was cut off
     start(tracker, sweep, planned, "pending-0")
     assert models(tracker) == []
 
@@ -306,13 +310,13 @@ def test_a_new_attempt_closes_what_a_killed_one_left(tracker):
     planned = cells("again")
     sweep = open_sweep(tracker, planned)
     killed = start(tracker, sweep, planned, "again-0")
-    half = tracker._create("policy 00", {"kind": "seed", "mlflow.parentRunId": killed.run_id})
+    half = tracker._create_run("policy 00", {"kind": "seed", "mlflow.parentRunId": killed.run_id})
     run = start(tracker, sweep, planned, "again-0")
     assert (status(tracker, killed.run_id), status(tracker, half)) == ("KILLED", "KILLED")
     assert tracker.client.get_run(killed.run_id).data.tags["superseded_by"] == run.run_id
     tracker.commit(run, make_result(planned["again-0"], "again-0"))
-    assert tracker.finished(planned) == {"again-0": run.run_id}
-    names = {run.info.run_name for run in tracker._search("tags.kind = 'cell'")}
+    assert tracker.reader.finished(planned) == {"again-0": run.run_id}
+    names = {run.info.run_name for run in tracker.experiment.search("tags.kind = 'cell'")}
     assert names == {"rec 100% e0", "rec 100% e0 (attempt 1)"}
 
 
@@ -324,7 +328,7 @@ def test_of_two_attempts_that_finish_the_first_counts(tracker):
     result = make_result(planned["late-0"], "late-0")
     assert tracker.commit(first, result) == first.run_id
     assert tracker.commit(second, result) == first.run_id
-    assert tracker.finished(planned) == {"late-0": first.run_id}
+    assert tracker.reader.finished(planned) == {"late-0": first.run_id}
     assert status(tracker, second.run_id) == "KILLED"
 
 
@@ -347,24 +351,24 @@ def test_a_failed_cell_is_listed_with_its_reason_until_it_is_finished(tracker):
     run = start(tracker, sweep, planned, "fail-0")
     tracker.fail(run, "loss is nan at postgresql://me:secret@host/db\n" + "x" * 20_000)
     assert status(tracker, run.run_id) == "FAILED"
-    reason = tracker.read_sweep("heads").failed["fail-0"]
+    reason = tracker.reader.read_sweep("heads").failed["fail-0"]
     assert "loss is nan" in reason
     assert "secret" not in reason
     train(tracker, sweep, planned, "fail-0")
-    assert tracker.read_sweep("heads").failed == {}
+    assert tracker.reader.read_sweep("heads").failed == {}
 
 
 def test_a_cell_that_failed_for_good_is_given_up_until_it_is_tried_again(tracker):
     planned = cells("permanent")
     sweep = open_sweep(tracker, planned)
     tracker.fail(start(tracker, sweep, planned, "permanent-0"), "no room", permanent=False)
-    assert tracker.given_up(planned) == {}
+    assert tracker.reader.given_up(planned) == {}
     tracker.fail(start(tracker, sweep, planned, "permanent-0"), "loss is nan", permanent=True)
-    assert tracker.given_up(planned) == {"permanent-0": "loss is nan"}
+    assert tracker.reader.given_up(planned) == {"permanent-0": "loss is nan"}
     again = start(tracker, sweep, planned, "permanent-0")  # as --retry-failed does
-    assert tracker.given_up(planned) == {}
+    assert tracker.reader.given_up(planned) == {}
     tracker.interrupt(again)
-    assert tracker.given_up(planned) == {}
+    assert tracker.reader.given_up(planned) == {}
 
 
 def test_uncommitted_changes_are_kept_with_the_cell_that_they_made(tracker):
@@ -373,7 +377,7 @@ def test_uncommitted_changes_are_kept_with_the_cell_that_they_made(tracker):
     result = make_result(planned["diff-0"], "diff-0")
     result.facts["provenance"] |= {"diff": "+A = 2\n", "diff_digest": "d" * 64, "seeds": {"encoder": 0}}
     tracker.commit(run, result)
-    assert tracker._text(run.run_id, "uncommitted.diff") == "+A = 2\n"
+    assert tracker.experiment.read_text(run.run_id, "uncommitted.diff") == "+A = 2\n"
     tags = tracker.client.get_run(run.run_id).data.tags
     assert (tags["diff_digest"], json.loads(tags["seeds"])) == ("d" * 64, {"encoder": 0})
 
@@ -394,7 +398,9 @@ def test_a_sweep_is_read_back_from_the_store_alone(tracker, uri):
     for number, key in enumerate(planned):
         train(tracker, sweep, planned, key, seed=number)
     tracker.close_sweep(sweep, "FINISHED")
-    record = Tracker(uri, experiment="test_a_sweep_is_read_back_from_the_store_alone").read_sweep("heads", "laptop")
+    record = Tracker(uri, experiment="test_a_sweep_is_read_back_from_the_store_alone").reader.read_sweep(
+        "heads", "laptop"
+    )
     assert (record.grid, record.profile, record.settings) == (GRID, "laptop", SETTINGS)
     assert list(record.planned.items()) == list(planned.items())
     assert record.complete
@@ -414,44 +420,24 @@ def test_the_same_plan_takes_the_same_run_up_again(tracker):
     assert open_sweep(tracker, planned, settings=other) != sweep
 
 
-def test_two_parents_started_at_once_share_one_sweep_run(tracker, uri):
-    planned = cells("both")
-    name = "test_two_parents_started_at_once_share_one_sweep_run"
-    trackers, found = [Tracker(uri, experiment=name) for _ in range(4)], []
-    gate = threading.Barrier(len(trackers))
-
-    def opened(one):
-        gate.wait()
-        found.append(open_sweep(one, planned))
-
-    threads = [threading.Thread(target=opened, args=(one,)) for one in trackers]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert len(found) == len(trackers)
-    assert len(set(found)) == 1
-    assert len(tracker._search("tags.kind = 'sweep'")) == 1
-
-
 def test_the_latest_opened_sweep_of_a_name_is_read(tracker):
     first, second = cells("first"), cells("second")
     open_sweep(tracker, first)
     open_sweep(tracker, second)
-    assert tracker.read_sweep("heads").planned == second
+    assert tracker.reader.read_sweep("heads").planned == second
     open_sweep(tracker, first)
-    assert tracker.read_sweep("heads").planned == first
+    assert tracker.reader.read_sweep("heads").planned == first
     open_sweep(tracker, second, profile="smoke")
-    assert tracker.read_sweep("heads", "laptop").planned == first
-    assert tracker.read_sweep("heads").profile == "smoke"
+    assert tracker.reader.read_sweep("heads", "laptop").planned == first
+    assert tracker.reader.read_sweep("heads").profile == "smoke"
 
 
 def test_an_unknown_sweep_names_those_there_are(tracker):
     open_sweep(tracker, cells("known"))
     with pytest.raises(BadInputError, match=r"no sweep 'haeds'.*heads \(laptop\)"):
-        tracker.read_sweep("haeds")
+        tracker.reader.read_sweep("haeds")
     with pytest.raises(BadInputError, match=r"heads \(smoke\)"):
-        tracker.read_sweep("heads", "smoke")
+        tracker.reader.read_sweep("heads", "smoke")
 
 
 def test_cells_of_another_sweep_are_found_and_the_reuse_is_shown(tracker):
@@ -461,7 +447,7 @@ def test_cells_of_another_sweep_are_found_and_the_reuse_is_shown(tracker):
     wider = {"reuse-0": planned["reuse-0"], "half": Cell(heads="rec", fraction=0.5)}
     sweep = open_sweep(tracker, wider, grid=grid)
     assert tracker.client.get_run(sweep).data.tags["reused"] == "rec 100% e0 from heads (laptop)"
-    record = tracker.read_sweep("datasize")
+    record = tracker.reader.read_sweep("datasize")
     assert set(record.results) == {"reuse-0"}
     assert not record.complete
 
@@ -470,7 +456,7 @@ def test_a_sweep_taken_up_after_its_frames_were_deleted_keeps_their_manifest(tra
     planned = cells("gone")
     open_sweep(tracker, planned)
     tracker.open_sweep(GRID, "laptop", SETTINGS, planned, {}, ORIGIN)
-    assert tracker.read_sweep("heads").data == DATA
+    assert tracker.reader.read_sweep("heads").data == DATA
 
 
 def test_what_a_killed_sweep_left_running_is_closed_by_the_next(tracker):
@@ -493,7 +479,7 @@ def test_settings_of_any_length_are_logged(tracker):
     grid = Grid(name="long", title="t" * 9000, heads=("rec",), claims=tuple(f"H{n}" for n in range(3000)))
     sweep = open_sweep(tracker, cells("long", grid), grid=grid)
     assert len(tracker.client.get_run(sweep).data.params["claims"]) < 6000
-    assert tracker.read_sweep("long").grid == grid
+    assert tracker.reader.read_sweep("long").grid == grid
 
 
 def test_files_are_added_to_a_run(tracker, tmp_path):
@@ -520,26 +506,24 @@ def test_a_finished_cell_without_its_whole_result_is_one_clear_error(tracker, da
         other = Path(tracker.client.get_run(train(tracker, sweep, planned, f"{damage}-1")).info.artifact_uri)
         shutil.copy(other / "result" / "cell.json", folder)
     with pytest.raises(BadInputError, match=rf"{run_id}.*run the sweep again"):
-        tracker.read_sweep("heads")
+        tracker.reader.read_sweep("heads")
 
 
-def test_a_moved_store_keeps_its_artifacts(tmp_path, network, empty_store):
+def test_a_moved_store_is_refused_until_its_old_place_is_a_link(tmp_path, empty_store):
     old, new = tmp_path / "old", tmp_path / "new place #1"
     old.mkdir()
     shutil.copy(empty_store, old)
     planned = cells("moved")
     first = Tracker(f"{SQLITE}{old}/mlflow.db")
-    sweep = open_sweep(first, planned)
-    run_id = first.commit(start(first, sweep, planned, "moved-0"), make_result(planned["moved-0"], "moved-0"), network)
-    first.client._tracking_client.store._dispose_engine()
-    old.rename(new)
-    tracker = Tracker(f"{SQLITE}{new}/mlflow.db")
-    assert_same_result(tracker.load_result(run_id), make_result(planned["moved-0"], "moved-0"))
-    assert network_at(tracker, f"runs:/{run_id}/driver").is_file()
-    for key in list(planned)[1:]:
-        train(tracker, sweep, planned, key)
-    assert tracker.read_sweep("heads").complete
-    assert not old.exists()
+    run_id = train(first, open_sweep(first, planned), planned, "moved-0")
+    shutil.move(old, new)
+    uri = f"{SQLITE}{new}/mlflow.db"
+    for use in (Tracker, Reader.look):
+        with pytest.raises(BadInputError, match=rf"moved or copied.*ln -s {new}/artifacts {old}/artifacts"):
+            use(uri)
+    old.mkdir()
+    (old / "artifacts").symlink_to(new / "artifacts")
+    assert_same_result(Tracker(uri).reader.load_result(run_id), make_result(planned["moved-0"], "moved-0"))
 
 
 def test_artifacts_that_are_kept_elsewhere_on_purpose_stay_there(uri, tmp_path):
@@ -548,7 +532,7 @@ def test_artifacts_that_are_kept_elsewhere_on_purpose_stay_there(uri, tmp_path):
     for key in planned:
         tracker = Tracker(uri, experiment="elsewhere")  # opened anew
         train(tracker, open_sweep(tracker, planned), planned, key)
-    assert tracker.read_sweep("heads").complete
+    assert tracker.reader.read_sweep("heads").complete
     assert (tmp_path / "artifacts").is_dir()
 
 
@@ -596,7 +580,7 @@ def test_a_server_that_is_not_there_is_one_quick_clear_error(port):
 
 
 def test_a_server_that_never_answers_is_given_up(port, monkeypatch):
-    monkeypatch.setattr("study.tracking.store.PROBE", 0.5)
+    monkeypatch.setattr("study.tracking.experiment.PROBE", 0.5)
     with socket.create_server(("127.0.0.1", port)):
         started = time.monotonic()
         with pytest.raises(TrackerLostError, match="does not answer"):
@@ -628,7 +612,7 @@ def test_credentials_are_hidden():
 
 
 def test_a_normal_use_prints_nothing(uri):
-    code = f"from study.tracking.tracker import Tracker; print(Tracker({uri!r}).finished(['x']), end='')"
+    code = f"from study.tracking.tracker import Tracker; print(Tracker({uri!r}).reader.finished(['x']), end='')"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert (done.stdout, done.stderr) == ("{}", "")
 
@@ -664,6 +648,6 @@ def test_a_server_lost_in_the_middle_is_one_clear_error_and_nothing_is_doubled_a
     tracking_server.start()
     assert tracker.commit(run, result) == run.run_id
     assert_no_point_twice(tracker, run.run_id)
-    record = tracker.read_sweep("heads")
+    record = tracker.reader.read_sweep("heads")
     assert set(record.results) == {"server-0", "server-1"}
     assert_same_result(record.results["server-1"], result)

@@ -164,7 +164,7 @@ def test_cells_come_back_into_mlflow_and_the_report_with_the_commit_that_trained
     assert output.count(": imported") == len(plan().cells)
     assert (packed / "reports/heads.pdf").read_bytes().startswith(b"%PDF")
     commit = subprocess.run(["git", "-C", str(ROOT), "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
-    record = Tracker(f"sqlite:///{packed}/mlruns/mlflow.db").read_sweep("heads")
+    record = Tracker(f"sqlite:///{packed}/mlruns/mlflow.db").reader.read_sweep("heads")
     assert {result.facts["provenance"]["commit"] for result in record.results.values()} == {commit.stdout.strip()}
 
 

@@ -139,7 +139,7 @@ def _report(source: str, tracking: str) -> Report:
     from study.tracking.tracker import Tracker  # noqa: PLC0415
 
     name, _, profile = sweep.partition(":")
-    return summarise(Tracker(uri or tracking).read_sweep(name, profile or None))
+    return summarise(Tracker(uri or tracking).reader.read_sweep(name, profile or None))
 
 
 if __name__ == "__main__":

@@ -71,7 +71,7 @@ def _write(path: Path, content: bytes) -> None:
 def publish(tracker: Tracker, name: str, profile: str | None, folder: Path) -> Path:
     """Build the report from the tracker alone, and add it to the sweep's run. Returns the PDF's path."""
     pdf = build_report(complete_cells(tracker, name, profile), folder)
-    own, sweep_run = folder / name, tracker.sweep_run(name, profile)
+    own, sweep_run = folder / name, tracker.reader.sweep_run(name, profile)
     tracker.log_files(sweep_run, [pdf, own / "report.json", own / "curves.parquet"], "report")
     tracker.log_files(sweep_run, sorted((own / "figures").iterdir()), "figures")
     return pdf
@@ -79,5 +79,7 @@ def publish(tracker: Tracker, name: str, profile: str | None, folder: Path) -> P
 
 def complete_cells(tracker: Tracker, name: str, profile: str | None) -> SweepRecord:
     """Return a sweep with those that vary one of its confounds."""
-    record = tracker.read_sweep(name, profile)
-    return replace(record, variants=tracker.read_variants(record))
+    from study.tracking.variants import read_variants  # noqa: PLC0415
+
+    record = tracker.reader.read_sweep(name, profile)
+    return replace(record, variants=read_variants(tracker.reader, record))

@@ -24,7 +24,7 @@ from study.results.cell_result import CellResult
 from study.stages import Flow
 from study.sweep.plan import Plan, cell_jobs
 from study.tracking.cell_run import CellRun
-from study.tracking.store import SQLITE, TrackerLostError
+from study.tracking.experiment import SQLITE, TrackerLostError
 from study.tracking.tracker import Tracker
 
 PATIENCE, RETRY = 600.0, 3.0  # [s] a lost server is waited for, and between two tries
@@ -56,7 +56,7 @@ class Committing:
         labels = {key: cell.label for key, cell in plan.cells.items()}
         self._trials = Trials(store_folder(options.tracking) / "optuna.db", plan.study_name, labels, order)
         # A file that cannot be written is no matter of seconds; a server that was restarted is.
-        self._patience = 0.0 if tracker.uri.startswith("sqlite") else PATIENCE
+        self._patience = 0.0 if tracker.experiment.is_file else PATIENCE
 
     def next_flow(self) -> tuple[str, Flow[Any]] | None:
         """Return the flow of the cell that Optuna names, or None when there is none left."""

@@ -42,7 +42,7 @@ def take_in(plan: Plan, folder: Path, keys: Sequence[str], tracker: Tracker) -> 
     from study.driving.driver import export_driver  # noqa: PLC0415 - torch, which a refusal does not need
 
     data = _manifest(plan, folder)
-    done = tracker.finished(list(plan.cells))
+    done = tracker.reader.finished(list(plan.cells))
     planned = (plan.grid, plan.profile, plan.settings, plan.cells)
     origin = provenance() | {"command": plan.command}
     sweep_run = tracker.open_sweep(*planned, data, origin)

@@ -25,7 +25,7 @@ from study.results.job import CellJob
 from study.stages import Cost, Work, data_cost
 
 if TYPE_CHECKING:
-    from study.tracking.tracker import Tracker
+    from study.tracking.reader import Reader
 
 
 @dataclass(frozen=True)
@@ -105,14 +105,14 @@ def given_plan(options: argparse.Namespace) -> Plan:
     return make_plan(options.sweep, options.profile, study_overrides(options), grid_overrides(options), options.data)
 
 
-def look_up(tracking: str) -> Tracker | None:
-    """The tracking store of that URI, or None where nothing was tracked yet. Looking makes nothing."""
+def look_up(tracking: str) -> Reader | None:
+    """Return a reader of that tracking store, or None where nothing was tracked yet, and create nothing."""
     path = tracking.removeprefix("sqlite:///")
     if path != tracking and not Path(path).is_file():
         return None  # and MLflow need not be loaded
-    from study.tracking.tracker import Tracker  # noqa: PLC0415
+    from study.tracking.reader import Reader  # noqa: PLC0415
 
-    return Tracker.look(tracking)
+    return Reader.look(tracking)
 
 
 def cell_jobs(plan: Plan, device: str, threads: int) -> dict[str, CellJob]:

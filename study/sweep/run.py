@@ -36,8 +36,8 @@ from study.tracking.tracker import Tracker
 
 def run_cells(plan: Plan, options: argparse.Namespace, tracker: Tracker) -> dict[str, str]:
     """Train what is not finished, until every cell is finished or has failed. Returns the failed, with reasons."""
-    done = tracker.finished(list(plan.cells))
-    given_up = {} if options.retry_failed else tracker.given_up(set(plan.cells) - set(done))
+    done = tracker.reader.finished(list(plan.cells))
+    given_up = {} if options.retry_failed else tracker.reader.given_up(set(plan.cells) - set(done))
     waiting = [key for key in plan.cells if key not in done and key not in given_up]
     costs = {key: cell_cost(plan.settings, plan.cells[key], plan.grid.policy_seeds).seconds for key in waiting}
     labels = {key: cell.label for key, cell in plan.cells.items()}

@@ -26,7 +26,7 @@ from study.sweep.options import add_plan_options
 from study.sweep.plan import Plan, given_plan, look_up
 
 if TYPE_CHECKING:
-    from study.tracking.cell_run import Attempt
+    from study.tracking.reader import Attempt
 
 
 State = Literal["finished", "running", "silent", "dead", "waiting", "failed"]

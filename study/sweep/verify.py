@@ -35,7 +35,7 @@ from study.results.job import CellJob
 from study.stages import cell_cost
 from study.sweep.options import add_plan_options
 from study.sweep.plan import Plan, given_plan, look_up
-from study.tracking.metrics import scores_of
+from study.tracking.metrics import final_scores
 
 EXIT_DIFFERS = 1
 COMPUTING = ("torch", "lightning", "numpy", "pandas")  # packages whose version can change a number
@@ -123,7 +123,7 @@ def judge(recorded: CellResult, again: CellResult, allowance: float) -> Verdict:
 
     Allowed is what two encoders may differ by their seeds alone, and three standard errors of the difference.
     """
-    scores = [scores_of(result)[ACCURACY].to_numpy(np.float64) for result in (recorded, again)]
+    scores = [final_scores(result)[ACCURACY].to_numpy(np.float64) for result in (recorded, again)]
     errors = [each.var(ddof=1) / len(each) if len(each) > 1 else 0.0 for each in scores]
     return Verdict(float(scores[0].mean()), float(scores[1].mean()), allowance + 3 * math.sqrt(sum(errors)))
 

@@ -1,4 +1,4 @@
-"""The run of one cell in MLflow."""
+"""The run of one cell in MLflow, while it is written."""
 
 from __future__ import annotations
 
@@ -13,12 +13,11 @@ from mlflow.entities import Metric, RunTag
 from mlflow.tracking import MlflowClient
 
 from study.config.grid import Cell
-from study.tracking.metrics import Point
-from study.tracking.store import TROUBLES
+from study.tracking.experiment import STORE_ERRORS
+from study.tracking.metrics import CurvePoint
 
 HOST, PROCESS, ALIVE = "host", "process", "alive"  # tags of an attempt: who writes it, and when last [ms since 1970]
-PERMANENT = "permanent"  # tag of a failed attempt: another try would not help
-SIGN = 5.0  # [s] between two signs of life
+HEARTBEAT = 5.0  # [s] between two heartbeats
 FLUSH = 2.0  # [s] between two writes of live curves
 
 Status = Literal["FINISHED", "FAILED", "KILLED"]
@@ -26,63 +25,52 @@ Status = Literal["FINISHED", "FAILED", "KILLED"]
 
 @dataclass
 class CellRun:
-    """One attempt at a cell. Points and tags gather here until `flush` writes them, many at a time."""
+    """One attempt at a cell. Points and tags are collected until `flush` writes them, many at a time."""
 
     run_id: str
     key: str
     cell: Cell
-    started: int
+    started: int  # [ms since 1970]
     client: MlflowClient
-    seeds: dict[int, str] = field(default_factory=dict)
+    seeds: dict[int, str] = field(default_factory=dict)  # policy seed -> run id
     _pending: list[Metric] = field(default_factory=list)
     _tags: dict[str, str] = field(default_factory=dict)
-    _signed: float = -math.inf
+    _heard: float = -math.inf
     _flushed: float = -math.inf
     _seen: set[tuple[str, int]] = field(default_factory=set)
 
     def log(self, stage: str, epoch: int, metrics: Mapping[str, float]) -> None:
-        """Take the points of one epoch, named such as "test/loss_rec". A point that is there already is left out."""
+        """Add the points of one epoch, named such as "test/loss_rec"."""
         self.add((f"{stage}/{name}", epoch, float(value)) for name, value in metrics.items())
 
     def note(self, **tags: str) -> None:
-        """Take tags of the attempt; the time goes with them as a sign of life."""
+        """Add tags of the attempt, with the time as its heartbeat."""
         self._tags |= tags | {ALIVE: str(time.time_ns() // 1_000_000)}
 
-    def progress(self, stage: str, done: int, whole: int) -> None:
-        """Take how far the training is; a few times a minute is enough for those who look."""
+    def progress(self, stage: str, done: int, total: int) -> None:
+        """Note how far the training is, a few times a minute."""
         now = time.monotonic()
-        if now - self._signed >= SIGN or done == whole:
-            self._signed = now
-            self.note(progress=f"{stage} {done}/{whole}")
+        if now - self._heard >= HEARTBEAT or done == total:
+            self._heard = now
+            self.note(progress=f"{stage} {done}/{total}")
 
-    def add(self, points: Iterable[Point]) -> None:
-        """Take points, less those that are there already."""
+    def add(self, points: Iterable[CurvePoint]) -> None:
+        """Add points; one that was added before is left out, since a resumed training logs it again."""
         for name, step, value in points:
             if (name, step) not in self._seen:
                 self._seen.add((name, step))
                 self._pending.append(Metric(name, value, self.started + step, step))
 
     def flush_live(self) -> None:
-        """Write what has gathered, every now and then. What cannot be written waits: `commit` writes it or says why."""
+        """Write what was added, every few seconds. What cannot be written is kept: `commit` writes it or fails."""
         if time.monotonic() - self._flushed >= FLUSH:
             self._flushed = time.monotonic()
-            with suppress(*TROUBLES):
+            with suppress(*STORE_ERRORS):
                 self.flush()
 
     def flush(self) -> None:
-        """Write what has gathered. Written in part, it may be written again: the same points are the same rows."""
+        """Write what was added. After an error it can be written again: the same points are the same rows."""
         if self._pending or self._tags:
             tags = [RunTag(*tag) for tag in self._tags.items()]
             self.client.log_batch(self.run_id, metrics=self._pending, tags=tags)
             self._pending, self._tags = [], {}
-
-
-@dataclass(frozen=True)
-class Attempt:
-    """One try at a cell as the store knows it; `started` in ms since 1970."""
-
-    run_id: str
-    status: str
-    started: int
-    tags: Mapping[str, str]
-    metrics: Mapping[str, float]

@@ -12,7 +12,6 @@ from mlflow.models import Model, ModelSignature
 from mlflow.tracking import MlflowClient
 from mlflow.types import Schema, TensorSpec
 
-import study.tracking.store  # noqa: F401 - mlflow reads the environment that this sets
 from study.config.paper import ACCELERATIONS, IMAGE
 from study.results.cell_result import CellResult
 
@@ -24,10 +23,10 @@ DIGITS = 4  # of an example's numbers: two neighbouring colours are 0.0039 apart
 
 
 def write_model(folder: Path, result: CellResult, network: bytes, run_id: str = "", model_id: str = "") -> None:
-    """Make the folder that mlflow.pytorch.load_model reads; `network` is what study.driving.driver has written.
+    """Write the folder that mlflow.pytorch.load_model reads; `network` comes from study.driving.driver.
 
-    Its `pytorch` flavour is written here and not by mlflow.pytorch, which would load torch and export once more. There
-    is no `python_function` flavour: MLflow's has room for one output, and this network has two.
+    The `pytorch` flavour is not written by mlflow.pytorch, which would load torch and export the network once more.
+    There is no `python_function` flavour: MLflow's has room for one output, and this network has two.
     """
     (folder / DATA).mkdir(parents=True)
     (folder / DATA / NETWORK).write_bytes(network)
@@ -37,14 +36,13 @@ def write_model(folder: Path, result: CellResult, network: bytes, run_id: str = 
     (folder / "requirements.txt").write_text(f"torch=={version.partition('+')[0]}\n" if version else "torch\n")
     seeds = len(result.policies["steering_2_bias"])
     number = np.dtype(np.float32)
+    inputs = Schema([TensorSpec(number, (-1, 3, IMAGE, IMAGE))])
+    outputs = Schema([TensorSpec(number, (seeds, -1), "steering"), TensorSpec(number, (seeds, -1, 3), "acceleration")])
     model = Model(
         artifact_path=MODEL,
         run_id=run_id or None,
         model_id=model_id or None,
-        signature=ModelSignature(
-            Schema([TensorSpec(number, (-1, 3, IMAGE, IMAGE))]),
-            Schema([TensorSpec(number, (seeds, -1), "steering"), TensorSpec(number, (seeds, -1, 3), "acceleration")]),
-        ),
+        signature=ModelSignature(inputs, outputs),
         saved_input_example_info={"artifact_path": EXAMPLE, "type": "ndarray", "format": "tf-serving"},
         metadata={
             "cell": result.cell.label,
@@ -58,10 +56,10 @@ def write_model(folder: Path, result: CellResult, network: bytes, run_id: str = 
 
 
 def log_model(client: MlflowClient, experiment: str, run_id: str, result: CellResult, network: bytes) -> str:
-    """Log the model of a cell run, or log it again where that broke off. Returns its id."""
-    there = client.search_logged_models([experiment], f"source_run_id = '{run_id}'")
-    if there:
-        model_id = str(there[0].model_id)
+    """Log the model of a cell run, or resume a logging that was cut off. Returns the model's id."""
+    models = client.search_logged_models([experiment], f"source_run_id = '{run_id}'")
+    if models:
+        model_id = str(models[0].model_id)
     else:
         cell = result.cell.model_dump(mode="json") | {"policy_seeds": len(result.policies["steering_2_bias"])}
         params = {name: str(value) for name, value in cell.items()}

@@ -1,0 +1,237 @@
+"""One experiment of an MLflow store: opening it, searching its runs, and one clear error when the store fails."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import re
+import shutil
+import sqlite3
+import tempfile
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock
+from mlflow.entities import Experiment as MlflowExperiment
+from mlflow.entities import Run
+from mlflow.exceptions import MlflowException
+from mlflow.tracking import MlflowClient
+from sqlalchemy.exc import SQLAlchemyError  # MLflow depends on sqlalchemy and lets its errors through
+
+from study.config.workspace import DEFAULT_TRACKING
+from study.errors import BadInputError, masked
+from study.tracking.run_page import experiment_tags
+
+SQLITE = "sqlite:///"
+SCHEMES = (SQLITE, "http://", "https://", "postgresql://", "postgresql+psycopg2://", "postgresql+psycopg://")
+PROBE = 3.0  # [s] within which a server must answer the first question ...
+BUSY = 30.0  # ... and the next ones, while it serves others
+BESIDE = "artifacts_beside_database"  # tag of an experiment whose artifacts this program has put beside the database
+STORE_ERRORS = (MlflowException, SQLAlchemyError, OSError)  # what MLflow raises when its store is lost
+ENVIRONMENT = {  # MLflow reads these at each call; a value that the user has set is kept
+    "MLFLOW_DISABLE_TELEMETRY": "true",
+    "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",
+    "MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR": "false",
+    "MLFLOW_HTTP_REQUEST_TIMEOUT": "30",
+    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "5",  # gives up after half a minute; MLflow's default is four minutes
+    "MLFLOW_HTTP_REQUEST_BACKOFF_FACTOR": "1",
+}
+
+
+class TrackerLostError(BadInputError):
+    """The store does not answer or cannot be written just now: another try may help."""
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """An experiment of an open store. `uri` is the store's, without credentials."""
+
+    client: MlflowClient
+    uri: str
+    id: str
+
+    @property
+    def is_file(self) -> bool:
+        """Whether the store is a database file, which belongs to one machine."""
+        return self.uri.startswith(SQLITE)
+
+    def guard(self) -> AbstractContextManager[None]:
+        """Turn errors of the store into TrackerLostError."""
+        return guard(self.uri)
+
+    def search(self, query: str) -> list[Run]:
+        """Return all runs that match, in the order of their start."""
+        runs: list[Run] = []
+        token = None
+        while True:
+            page = self.client.search_runs([self.id], query, max_results=1000, page_token=token)
+            runs += page
+            token = page.token
+            if not token:
+                return sorted(runs, key=lambda run: (run.info.start_time, run.info.run_id))
+
+    def read_text(self, run_id: str, artifact: str) -> str:
+        """Return the content of a text artifact."""
+        with tempfile.TemporaryDirectory() as folder:
+            return Path(self.client.download_artifacts(run_id, artifact, folder)).read_text(encoding="utf-8")
+
+    def read_json(self, run_id: str, artifact: str) -> dict[str, Any]:
+        """Return the content of a JSON artifact. Raises BadInputError when it is damaged."""
+        try:
+            return dict(json.loads(self.read_text(run_id, artifact)))
+        except (ValueError, TypeError):
+            raise BadInputError(
+                f"{artifact} of run {run_id} in {self.uri} is no JSON object; run the sweep again"
+            ) from None
+
+
+def open_experiment(uri: str, name: str) -> Experiment:
+    """Open an experiment, and create it and its store where they are missing.
+
+    Raises TrackerLostError when the store does not answer, BadInputError when it cannot be used.
+    """
+    client, shown, artifacts = _connect(uri)
+    with guard(shown, opening=True), few_tries(BUSY):
+        if client.get_experiment_by_name(name) is None:
+            client.create_experiment(name, str(artifacts) if artifacts else None, {BESIDE: "true"})
+        found = client.get_experiment_by_name(name)
+        experiment = _usable(found, client, shown, artifacts)
+        for key, value in experiment_tags(experiment.id, found.tags).items():
+            if found.tags.get(key) != value:
+                client.set_experiment_tag(experiment.id, key, value)
+    return experiment
+
+
+def find_experiment(uri: str, name: str) -> Experiment | None:
+    """Return an experiment, or None where there is none of that name, and create nothing."""
+    database = database_file(uri)
+    if database and not database.exists():
+        return None
+    client, shown, artifacts = _connect(uri)
+    with guard(shown, opening=True), few_tries():
+        found = client.get_experiment_by_name(name)
+        return _usable(found, client, shown, artifacts) if found else None
+
+
+def database_file(uri: str) -> Path | None:
+    """Return the file of a SQLite store, or None for another kind."""
+    return Path(uri.removeprefix(SQLITE).partition("?")[0]).absolute() if uri.startswith(SQLITE) else None
+
+
+@contextmanager
+def guard(shown: str, *, opening: bool = False) -> Iterator[None]:
+    """Turn errors of the store into TrackerLostError; errors that tell of wrong calls stay what they are."""
+    try:
+        yield
+    except (*STORE_ERRORS, ImportError) as error:  # ImportError: the driver of a database is missing
+        code = getattr(error, "error_code", None)
+        if code in ("INVALID_PARAMETER_VALUE", "BAD_REQUEST") and not opening:
+            raise
+        text = " ".join(masked(str(error)).split())[:400]
+        step = "start it, or choose another with --tracking"
+        if shown.startswith(SQLITE):
+            step = "look at disk space and rights, or choose another with --tracking"
+        if "db upgrade" in text:
+            step = f"copy the file, then run: mlflow db upgrade {shown}"
+        # `from None`: the chained error may show credentials.
+        raise TrackerLostError(f"the tracking store {shown} gave no usable answer: {text}; {step}") from None
+
+
+@contextmanager
+def few_tries(seconds: float = PROBE) -> Iterator[None]:
+    """Have MLflow ask a server at most twice, with `seconds` to answer."""
+    fewer = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1", "MLFLOW_HTTP_REQUEST_TIMEOUT": str(int(seconds))}
+    before = {name: os.environ[name] for name in fewer}  # set when the store was opened
+    os.environ.update(fewer)
+    try:
+        yield
+    finally:
+        os.environ.update(before)
+
+
+def _connect(uri: str) -> tuple[MlflowClient, str, Path | None]:
+    """Return a client, the URI without credentials, and the folder of a new experiment's artifacts; servers know it."""
+    # Process-wide, as MLflow wants it: nothing is printed, and no usage data are sent.
+    for name, value in ENVIRONMENT.items():
+        os.environ.setdefault(name, value)
+    for name in ("mlflow", "alembic"):  # they log errors with tracebacks; commands print them in one line
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    shown = masked(uri)
+    if not uri.startswith(SCHEMES) or uri == SQLITE:
+        raise BadInputError(f"tracking URI '{shown}' cannot be used; give {DEFAULT_TRACKING} or http://host:port")
+    database, artifacts = database_file(uri), None
+    if database:
+        _prepare_database(database, shown)
+        uri, artifacts = f"{SQLITE}{database}", database.parent / "artifacts"
+    elif uri.startswith("http"):
+        _probe(uri, shown)
+    else:
+        artifacts = Path(DEFAULT_TRACKING.removeprefix(SQLITE)).absolute().parent / "artifacts"
+    with guard(shown, opening=True), few_tries(BUSY):
+        return MlflowClient(uri), shown, artifacts
+
+
+def _usable(found: MlflowExperiment, client: MlflowClient, shown: str, artifacts: Path | None) -> Experiment:
+    if found.lifecycle_stage != "active":
+        raise BadInputError(
+            f"experiment '{found.name}' in {shown} is deleted; restore it: MLFLOW_TRACKING_URI={shown} "
+            f"mlflow experiments restore --experiment-id {found.experiment_id}"
+        )
+    # MLflow stores absolute paths of artifacts and has no way to change them.
+    place = Path(found.artifact_location)
+    if shown.startswith(SQLITE) and artifacts and BESIDE in found.tags and place.resolve() != artifacts.resolve():
+        raise BadInputError(
+            f"{shown} was moved or copied: it expects its artifacts in {place}, not in {artifacts}; use it where it "
+            f"was, or, if it was moved, link the old path to the new one: ln -s {artifacts} {place}"
+        )
+    return Experiment(client, shown, str(found.experiment_id))
+
+
+def _probe(uri: str, shown: str) -> None:
+    """Raise TrackerLostError when a server does not answer within PROBE seconds."""
+    url = re.sub(r"//[^/@]*@", "//", uri).rstrip("/") + "/health"
+    try:
+        with urllib.request.urlopen(url, timeout=PROBE):  # noqa: S310 - the scheme is http or https
+            pass
+    except urllib.error.HTTPError:
+        pass  # it answers; the first question shows whether it is MLflow
+    except (OSError, ValueError) as error:
+        raise TrackerLostError(
+            f"the tracking server {shown} does not answer ({getattr(error, 'reason', error)}); start it (mlflow "
+            f"server), check the address, or leave --tracking out to use {DEFAULT_TRACKING}"
+        ) from None
+
+
+def _prepare_database(database: Path, shown: str) -> None:
+    """Create the file where it is missing; refuse one that is not MLflow's."""
+    try:
+        if not database.exists():
+            create_database(database)
+        with sqlite3.connect(f"{database.as_uri()}?mode=ro", uri=True, timeout=20) as connection:
+            tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+        connection.close()
+    except (OSError, sqlite3.Error, SQLAlchemyError, MlflowException) as error:
+        raise BadInputError(
+            f"{shown} cannot be used as a tracking store: {error}; move the file away or give another --tracking"
+        ) from None
+    if not {"experiments", "runs"} <= tables:
+        raise BadInputError(f"{shown} is a database, but not MLflow's; give another file with --tracking")
+
+
+def create_database(database: Path) -> None:
+    """Create the file atomically: MLflow needs seconds for its tables, and may be killed meanwhile."""
+    database.parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(database.with_name(f".{database.name}.lock")):
+        if not database.exists():
+            folder = database.with_name(f".{database.name}.draft")  # SQLite writes a journal beside the draft
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir()
+            MlflowClient(f"{SQLITE}{folder / database.name}").search_experiments()
+            (folder / database.name).replace(database)
+            shutil.rmtree(folder)

@@ -1,0 +1,167 @@
+"""Read results from MLflow: which cells are finished, how attempts stand, and whole sweeps for reports.
+
+A cell is done when its run is FINISHED with its `cell_key`, whichever sweep has trained it.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+from mlflow.entities import Run
+
+from study.config.grid import Cell, Grid
+from study.config.settings import StudySettings
+from study.config.workspace import DEFAULT_TRACKING
+from study.errors import BadInputError
+from study.results.cell_result import CellResult
+from study.results.sweep_record import SweepRecord
+from study.tracking.experiment import Experiment, find_experiment
+
+PLAN_VERSION = 1
+RESULT = "result"  # artifact folder of a cell run
+PERMANENT = "permanent"  # tag of a failed attempt: another try would not help
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """One attempt at a cell; `started` in ms since 1970."""
+
+    run_id: str
+    status: str
+    started: int
+    tags: Mapping[str, str]
+    metrics: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Reader:
+    """Reads the results in an experiment. Every method raises TrackerLostError when the store stops answering."""
+
+    experiment: Experiment
+
+    @classmethod
+    def look(cls, uri: str = DEFAULT_TRACKING, experiment: str = "study") -> Self | None:
+        """Return a reader, or None where nothing was tracked yet, and create nothing."""
+        found = find_experiment(uri, experiment)
+        return cls(found) if found else None
+
+    def finished(self, keys: Collection[str]) -> dict[str, str]:
+        """Return key -> run id of the cells that are done; of several runs of one key, the first that was done."""
+        return {key: str(run.info.run_id) for key, run in self.finished_runs(keys).items()}
+
+    def finished_runs(self, keys: Collection[str]) -> dict[str, Run]:
+        """Return key -> run of the cells that are done, as `finished`."""
+        with self.experiment.guard():
+            runs = self.experiment.search("tags.kind = 'cell' and attributes.status = 'FINISHED'")
+        first: dict[str, Run] = {}
+        for run in in_order_of_end(runs):
+            first.setdefault(run.data.tags.get("cell_key"), run)
+        return {key: first[key] for key in keys if key in first}
+
+    def attempts(self, keys: Collection[str]) -> dict[str, list[Attempt]]:
+        """Return key -> the attempts at that cell in their order; cells without any are left out."""
+        attempts: dict[str, list[Attempt]] = {}
+        with self.experiment.guard():
+            runs = self.experiment.search("tags.kind = 'cell'")
+        for run in runs:
+            if (key := run.data.tags.get("cell_key")) in keys:
+                info, data = run.info, run.data
+                attempt = Attempt(info.run_id, info.status, info.start_time, data.tags, data.metrics)
+                attempts.setdefault(key, []).append(attempt)
+        return attempts
+
+    def given_up(self, keys: Collection[str]) -> dict[str, str]:
+        """Return key -> reason of the cells whose last attempt has failed for a permanent reason."""
+        last = {key: attempts[-1] for key, attempts in self.attempts(keys).items()}
+        return {key: reason_of(attempt.tags) for key, attempt in last.items() if PERMANENT in attempt.tags}
+
+    def load_result(self, run_id: str) -> CellResult:
+        """Return the result that a finished cell run holds. Raises BadInputError when it is not whole."""
+        with self.experiment.guard(), tempfile.TemporaryDirectory() as folder:
+            key = self.experiment.client.get_run(run_id).data.tags.get("cell_key")
+            try:
+                result = CellResult.load(Path(self.experiment.client.download_artifacts(run_id, RESULT, folder)))
+                problem = "" if result.key == key else f"it is the result of cell {result.key}"
+            except (OSError, BadInputError) as error:
+                problem = str(error).replace(f"{folder}/", "")
+        if problem:
+            raise BadInputError(
+                f"cell run {run_id} in {self.experiment.uri} is FINISHED but does not hold the result of cell {key} "
+                f"({problem}); delete that run in MLflow and run the sweep again"
+            )
+        return result
+
+    def sweep_runs(self) -> list[Run]:
+        """Return the sweep runs, the latest opened last."""
+        with self.experiment.guard():
+            return sorted(self.experiment.search("tags.kind = 'sweep'"), key=opened_at)
+
+    def sweep_run(self, name: str, profile: str | None = None) -> str:
+        """Return the run id of the latest sweep of that name. Raises BadInputError when there is none."""
+        runs = self.sweep_runs()
+        for run in reversed(runs):
+            tags = run.data.tags
+            if tags.get("sweep") == name and profile in (None, tags.get("profile")):
+                return str(run.info.run_id)
+        wanted = f"{name} ({profile})" if profile else name
+        names = ", ".join(sorted({str(run.info.run_name) for run in runs})) or "none yet"
+        raise BadInputError(
+            f"no sweep '{wanted}' in {self.experiment.uri}; there are: {names}. Run it with: python -m study.sweep "
+            f"{name}"
+        )
+
+    def read_sweep(self, name: str, profile: str | None = None) -> SweepRecord:
+        """Return the latest sweep of that name with its finished cells."""
+        return self.read_sweep_run(self.sweep_run(name, profile))
+
+    def read_settings(self, sweep_run_id: str) -> StudySettings:
+        """Return a sweep's settings. Raises BadInputError when another version of this program planned it."""
+        return self._read_plan(sweep_run_id)[2]
+
+    def read_sweep_run(self, run_id: str) -> SweepRecord:
+        """Return a sweep with its finished cells."""
+        grid, profile, settings, planned = self._read_plan(run_id)
+        with self.experiment.guard():
+            provenance = self.experiment.read_json(run_id, "provenance.json")
+            provenance["diff"] = self.experiment.read_text(run_id, "uncommitted.diff")
+            data = self.experiment.read_json(run_id, "data.json")
+            failures = self.experiment.search("tags.kind = 'cell' and attributes.status = 'FAILED'")
+        done = self.finished(planned)
+        reasons = {run.data.tags.get("cell_key"): reason_of(run.data.tags) for run in failures}
+        failed = {key: reason for key, reason in reasons.items() if key in planned and key not in done}
+        results = {key: self.load_result(run) for key, run in done.items()}
+        return SweepRecord(grid, profile, settings, planned, results, failed, provenance, data)
+
+    def _read_plan(self, run_id: str) -> tuple[Grid, str, StudySettings, dict[str, Cell]]:
+        with self.experiment.guard():
+            plan = self.experiment.read_json(run_id, "plan.json")
+        try:
+            if plan.get("format_version") != PLAN_VERSION:
+                raise ValueError(f"format {plan.get('format_version')}, not {PLAN_VERSION}")  # noqa: TRY301
+            planned = {key: Cell.model_validate(cell) for key, cell in plan["planned"].items()}
+            settings = StudySettings.model_validate(plan["settings"])
+            return Grid.model_validate(plan["grid"]), str(plan["profile"]), settings, planned
+        except ValueError as error:  # pydantic's error is one
+            raise BadInputError(
+                f"sweep run {run_id} in {self.experiment.uri} was planned by another version of this program "
+                f"({error}); run the sweep again"
+            ) from error
+
+
+def reason_of(tags: Mapping[str, str]) -> str:
+    """Return why an attempt has failed."""
+    return tags.get("reason", "unknown")
+
+
+def in_order_of_end(runs: Iterable[Run]) -> list[Run]:
+    """Return finished runs, the first that ended first: of two results of one key it counts."""
+    return sorted(runs, key=lambda run: (run.info.end_time, run.info.run_id))
+
+
+def opened_at(sweep_run: Run) -> int:
+    """Return when a sweep was last opened, in ms since 1970."""
+    return int(sweep_run.data.tags.get("opened", 0))
