@@ -67,7 +67,7 @@ class Samples(Dataset):
 
     def __init__(self, frames: Frames, rows: np.ndarray, heads: str) -> None:
         self.frames, self.rows = frames, rows
-        self.masks = [("pred", "plan").index(head) for head in HEAD_SETS[heads] if head != "rec"]
+        self.masks = [("pred", "plan").index(head) for head in HEAD_SETS[heads].heads if head != "rec"]
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -86,18 +86,20 @@ class PlainAutoencoder(Timed):
         super().__init__()
         self.lr = lr
         layers: list[nn.Module] = []
-        for before, after in itertools.pairwise((HEADS["rec"], *CHANNELS)):
+        for before, after in itertools.pairwise((HEADS["rec"].channels, *CHANNELS)):
             layers += [nn.Conv2d(before, after, KERNEL, STRIDE), nn.BatchNorm2d(after), nn.ReLU()]
         core = CHANNELS[-1] * CORE * CORE
         self.encoder = nn.Sequential(*layers, nn.Flatten(), nn.Linear(core, LATENT))
         self.heads = nn.ModuleDict()
-        for head in HEAD_SETS[heads]:
+        for head in HEAD_SETS[heads].heads:
             layers = [nn.Linear(LATENT, core), nn.BatchNorm1d(core), nn.ReLU()]
             layers += [nn.Unflatten(1, (CHANNELS[-1], CORE, CORE))]
             for (before, after), extra in zip(itertools.pairwise(CHANNELS[::-1]), (0, 1), strict=True):
                 layers += [nn.ConvTranspose2d(before, after, KERNEL, STRIDE, output_padding=extra)]
                 layers += [nn.BatchNorm2d(after), nn.ReLU()]
-            self.heads[head] = nn.Sequential(*layers, nn.ConvTranspose2d(CHANNELS[0], HEADS[head], KERNEL, STRIDE))
+            self.heads[head] = nn.Sequential(
+                *layers, nn.ConvTranspose2d(CHANNELS[0], HEADS[head].channels, KERNEL, STRIDE)
+            )
 
     def _loss(self, batch: list[Tensor], split: str) -> Tensor:
         image, masks = batch

@@ -124,15 +124,15 @@ def encoder_work(heads: str, size: int) -> tuple[int, int]:
     forward; backward it is read again, and its gradient written and read.
     """
     sides = list(itertools.accumulate(CHANNELS, lambda side, _: (side - KERNEL) // 2 + 1, initial=IMAGE))
-    ways = list(itertools.pairwise((HEADS["rec"], *CHANNELS)))
+    ways = list(itertools.pairwise((HEADS["rec"].channels, *CHANNELS)))
     each = [a * b * KERNEL**2 * side**2 for (a, b), side in zip(ways, sides[1:], strict=True)]
     connected = CHANNELS[-1] * CORE**2 * LATENT
     numbers = sum(after * side**2 for (_, after), side in zip(ways, sides[1:], strict=True))
     multiplications = 3 * (sum(each) + connected) - each[0]
     moved = 5 * numbers * size + IMAGE**2 * 3
-    for head in HEAD_SETS[heads]:
-        multiplications += 3 * (sum(each[1:]) + each[0] * HEADS[head] // HEADS["rec"] + connected)
-        moved += 5 * (numbers * size + HEADS[head] * IMAGE**2 * 4) + IMAGE**2 // 8
+    for head in HEAD_SETS[heads].heads:
+        multiplications += 3 * (sum(each[1:]) + each[0] * HEADS[head].channels // HEADS["rec"].channels + connected)
+        moved += 5 * (numbers * size + HEADS[head].channels * IMAGE**2 * 4) + IMAGE**2 // 8
     return multiplications, moved
 
 

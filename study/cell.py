@@ -20,7 +20,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from study.compute.provenance import provenance
-from study.config.heads import CEILING
+from study.config.heads import CEILING, load_heads
 from study.config.keys import cell_key
 from study.data.frames import Frames, FrameStore, open_frames
 from study.data.prepare import data_flow
@@ -248,6 +248,7 @@ def assemble_result(
 
 def _begin(job: CellJob, report: Report | None = None) -> tuple[FrameStore, str, dict[str, Any]]:
     """Return the frames, made here where they are missing, the device, and facts about what computes."""
+    load_heads(job.head_modules)
     device = _compute_on(job, report)
     # Now, not at the end: the code that runs is the one that was loaded, whatever is edited meanwhile.
     origin = provenance() | {"determinism": determinism(), "seeds": _seeds(job)}

@@ -127,7 +127,7 @@ def _encoder_seconds(work: Work) -> float:
     if encoder.budget == "epochs":
         train *= work.cell.fraction
     images = encoder.epochs * (train + TEST_COST * frames.encoder * frames.test_share)
-    return images * (ENCODER_IMAGE_S + HEAD_IMAGE_S * len(HEAD_SETS[work.cell.heads]))
+    return images * (ENCODER_IMAGE_S + HEAD_IMAGE_S * len(HEAD_SETS[work.cell.heads].heads))
 
 
 def _latents_seconds(work: Work) -> float:

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Self
 
 from pydantic import Field, model_validator
 
-from study.config.heads import CEILING, HEAD_SETS
+from study.config.heads import CEILING, HEAD_SETS, load_heads
 from study.config.settings import Count, NotNegative, Settings, Share
 
 Fraction = Annotated[float, Field(gt=0, le=1)]
@@ -49,6 +49,7 @@ class Grid(Settings):
 
     name: str
     title: str = Field(description="headline of the report")
+    head_modules: tuple[str, ...] = Field((), description="Python modules with further heads and head sets")
     heads: Annotated[tuple[str, ...], Field(min_length=1)] = Field(description="head sets")
     fractions: Annotated[tuple[Fraction, ...], Field(min_length=1)] = Field(
         (1.0,), description="data fractions in (0, 1] (Sec. V-B)"
@@ -63,6 +64,7 @@ class Grid(Settings):
 
     @model_validator(mode="after")
     def _known(self) -> Self:
+        load_heads(self.head_modules)
         for heads in (*self.heads, self.baseline):
             if heads not in HEAD_SETS:
                 raise ValueError(f"unknown head set '{heads}'; choose from {', '.join(HEAD_SETS)}")

@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from study.config.grid import Cell
-from study.config.heads import CEILING, HEAD_SETS
+from study.config.heads import CEILING, HEAD_SETS, further_masks
 from study.config.settings import StudySettings
 
 
@@ -46,10 +46,12 @@ def drive_name(seed: int) -> str:
 
 def frames_key(settings: StudySettings, source: str | None = None) -> str:
     """Key of the frame store; `source` stands for the drives when they are not our town's."""
-    own = {
+    own: dict[str, Any] = {
         "frames": settings.frames.model_dump(mode="json", exclude={"unit"}),  # says how a store is used
         "birdview": settings.birdview.model_dump(mode="json"),
     }
+    if further_masks():
+        own["masks"] = further_masks()
     if source is None:
         own["drives"] = settings.recording.model_dump(
             mode="json", include={"encoder_episodes", "policy_episodes", "seed"}
@@ -63,7 +65,7 @@ def encoder_key(settings: StudySettings, cell: Cell, frames: str) -> str:
         return content_key("state", {}, (frames,), FORMAT_VERSIONS["state"])
     own: dict[str, Any] = {
         "encoder": settings.encoder.model_dump(mode="json", exclude={"budget", "head_weights"}),
-        "heads": {head: settings.encoder.head_weights.get(head, 1.0) for head in HEAD_SETS[cell.heads]},
+        "heads": {head: settings.encoder.head_weights.get(head, 1.0) for head in HEAD_SETS[cell.heads].heads},
         "fraction": cell.fraction,
         "encoder_seed": cell.encoder_seed,
     }

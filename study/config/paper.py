@@ -25,8 +25,8 @@ def parameter_counts() -> dict[str, int]:
     encoder = sum(i * o * area + o + 2 * o for i, o in convolutions) + core * LATENT + LATENT
     counts = {"encoder": encoder}
     widths = CHANNELS[::-1]
-    for head, channels in HEADS.items():
+    for name, head in HEADS.items():
         fully_connected = LATENT * core + core + 2 * core
         hidden = sum(i * o * area + o + 2 * o for i, o in itertools.pairwise(widths))
-        counts[head] = fully_connected + hidden + widths[-1] * channels * area + channels
+        counts[name] = fully_connected + hidden + widths[-1] * head.channels * area + head.channels
     return counts

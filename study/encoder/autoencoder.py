@@ -38,10 +38,10 @@ class MultiHeadAutoencoder(lightning.LightningModule):
         if heads not in HEAD_SETS:
             raise one_of("head set", heads, HEAD_SETS)
         self.settings, self.beta = settings, settings.beta
-        self.head_weights = {head: settings.head_weights.get(head, 1.0) for head in HEAD_SETS[heads]}
+        self.head_weights = {head: settings.head_weights.get(head, 1.0) for head in HEAD_SETS[heads].heads}
         self.automatic_optimization = False  # gradients come head by head, see `losses`
         self.encoder = Encoder(variational=settings.beta > 0)
-        self.decoders = nn.ModuleDict({head: Decoder(HEADS[head]) for head in HEAD_SETS[heads]})
+        self.decoders = nn.ModuleDict({head: Decoder(HEADS[head].channels) for head in HEAD_SETS[heads].heads})
         initialise(self.encoder, seeded_generator(encoder_seed, "encoder"))
         for head, decoder in self.decoders.items():
             initialise(decoder, seeded_generator(encoder_seed, f"decoder {head}"))

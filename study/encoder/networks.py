@@ -15,7 +15,7 @@ from study.config.heads import HEADS
 from study.config.paper import CHANNELS, CORE, IMAGE, KERNEL, LATENT, STRIDE
 
 _CORE_NUMBERS = CHANNELS[-1] * CORE * CORE
-PIXELS = HEADS["rec"] * IMAGE * IMAGE
+PIXELS = HEADS["rec"].channels * IMAGE * IMAGE
 
 
 class _Convolution(nn.Conv2d):
@@ -90,7 +90,7 @@ class Encoder(nn.Module):
     def __init__(self, variational: bool = False) -> None:
         super().__init__()
         layers: list[nn.Module] = []
-        for before, after in itertools.pairwise((HEADS["rec"], *CHANNELS)):
+        for before, after in itertools.pairwise((HEADS["rec"].channels, *CHANNELS)):
             layers += [_Convolution(before, after, KERNEL, STRIDE), nn.BatchNorm2d(after), nn.ReLU(inplace=True)]
         self.convolutions = nn.Sequential(*layers)
         self.mean = nn.Linear(_CORE_NUMBERS, LATENT)

@@ -49,9 +49,9 @@ def step_bytes(heads: str, batch: int, precision: str) -> int:
     """
     sides = list(itertools.accumulate(CHANNELS, lambda side, _: (side - KERNEL) // STRIDE + 1, initial=IMAGE))[1:]
     layers = sum(channels * side**2 for channels, side in zip(CHANNELS, sides, strict=True))
-    colours = sum(HEADS[head] for head in HEAD_SETS[heads])
-    image = 3 * (2 if precision == "bf16" else 4) * layers * (1 + len(HEAD_SETS[heads]))
-    image += 5 * 4 * (HEADS["rec"] + colours) * IMAGE**2
+    colours = sum(HEADS[head].channels for head in HEAD_SETS[heads].heads)
+    image = 3 * (2 if precision == "bf16" else 4) * layers * (1 + len(HEAD_SETS[heads].heads))
+    image += 5 * 4 * (3 + colours) * IMAGE**2
     return batch * image + SPARE_BYTES
 
 
@@ -120,7 +120,7 @@ def train_encoder(
         "device": target.type,
         "frames_an_epoch": plan.frames_an_epoch,
         # As in the encoder's key, a setting that makes no difference here must not refuse a checkpoint.
-        "weights": {head: settings.head_weights.get(head, 1.0) for head in HEAD_SETS[heads]},
+        "weights": {head: settings.head_weights.get(head, 1.0) for head in HEAD_SETS[heads].heads},
         **settings.model_dump(mode="json", exclude={"precision", "budget", "head_weights"}),
     }
     course = _Course(module, plan, training, checkpoint, log, progress)

@@ -11,9 +11,11 @@ import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-COLOUR = {"rec": "#000000", "rec+pred": "#E69F00", "rec+plan": "#0072B2", "full": "#D55E00"}
-LINE = {"rec": "-", "rec+pred": "-.", "rec+plan": "--", "full": "-"}
-MARKER = {"rec": "o", "rec+pred": "^", "rec+plan": "s", "full": "D"}
+from study.config.heads import HEAD_SETS
+
+COLOUR = {name: head_set.colour for name, head_set in HEAD_SETS.items()}
+LINE = {name: head_set.line for name, head_set in HEAD_SETS.items()}
+MARKER = {name: head_set.marker for name, head_set in HEAD_SETS.items()}
 FRACTION_COLOUR = ("#D55E00", "#E69F00", "#009E73", "#56B4E9", "#CC79A7")
 FRACTION_MARKER = ("D", "^", "s", "v", "P")
 LIGHT_COLOUR, LIGHT_WORDS = ("#BBBBBB", "#E69F00", "#D55E00"), ("green or none", "yellow", "red")

@@ -222,7 +222,7 @@ def _encoders(table: pd.DataFrame, cells: Mapping[Point, str]) -> Iterator[Encod
         last = own[own["epoch"] == own["epoch"].max()].groupby(["metric", "split"])["value"].mean()
         losses = {
             head: {split: last.get((f"loss_{head}", split), math.nan) for split in ("train", "test")}
-            for head in HEAD_SETS[heads]
+            for head in HEAD_SETS[heads].heads
         }
         yield EncoderLosses(cell=cell, encoders=own["encoder_seed"].nunique(), losses=losses)
 

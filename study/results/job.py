@@ -17,6 +17,7 @@ class CellJob:
     `frames` is the frame store's folder and `drives` that of the drives it was made from, `imported` when these are not
     our town's; where the frames are missing they are made from them. `scratch` holds checkpoints and the products of
     finished stages. `device` is "auto" or a torch device. Folders are relative to the working folder of whoever runs.
+    `head_modules` name further heads (see `Grid`).
     """
 
     cell: Cell
@@ -29,3 +30,4 @@ class CellJob:
     device: str = "auto"
     threads: int = 1
     imported: Imported | None = None
+    head_modules: tuple[str, ...] = ()

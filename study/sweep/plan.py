@@ -119,6 +119,6 @@ def cell_jobs(plan: Plan, device: str, threads: int) -> dict[str, CellJob]:
     """Return what training each cell needs to know, by key."""
     seeds, folders = plan.grid.policy_seeds, (plan.frames, plan.drives, DATA)
     return {
-        key: CellJob(cell, key, plan.settings, seeds, *folders, device, threads, plan.imported)
+        key: CellJob(cell, key, plan.settings, seeds, *folders, device, threads, plan.imported, plan.grid.head_modules)
         for key, cell in plan.cells.items()
     }

@@ -6,11 +6,10 @@ import json
 from collections.abc import Mapping
 
 from study.config.grid import Cell
-from study.config.heads import CEILING, HEAD_SETS
+from study.config.heads import HEAD_SETS
 
 NOTE = "mlflow.note.content"
 COLOUR = "mlflow.runColor"
-COLOURS = {"rec": "#000000", "rec+pred": "#E69F00", "rec+plan": "#0072B2", "full": "#D55E00"}
 VIEW = "cells"  # the pages open with it at ?viewStateShareKey=cells
 COLUMNS = {  # of the view, with their widths in pixels
     "params.`heads`": 90,
@@ -53,17 +52,17 @@ def experiment_tags(experiment: str, existing: Mapping[str, str]) -> dict[str, s
 
 def cell_tags(cell: Cell, policy_seeds: int) -> dict[str, str]:
     """Return a cell run's description, and the colour of its head set in the figures."""
-    if cell.heads == CEILING:
-        training = f"{policy_seeds} policies on the true state, without encoder"
-    else:
+    head_set = HEAD_SETS.get(cell.heads)
+    training = f"{policy_seeds} policies on the true state, without encoder"
+    if head_set is not None:
         training = (
-            f"An encoder trained with the heads {' + '.join(HEAD_SETS[cell.heads])} on {cell.fraction * 100:g} % of "
-            f"the data (encoder seed {cell.encoder_seed}), and {policy_seeds} policies on its frozen latent; model "
-            "`driver` is all of them as one network"
+            f"An encoder trained with the heads {' + '.join(head_set.heads)} on {cell.fraction * 100:g} % of the data "
+            f"(encoder seed {cell.encoder_seed}), and {policy_seeds} policies on its frozen latent; model `driver` is "
+            "all of them as one network"
         )
     note = (
         f"{training}. Curves `policy/...` are means over the policies; `/sd`, `/low`, `/high` are their standard "
         "deviation and the 95 % interval of that mean. `final/...` is the mean of the last five epochs on test "
         "frames, `floor` the accuracy of always saying the commonest class."
     )
-    return {NOTE: note, **({COLOUR: COLOURS[cell.heads]} if cell.heads in COLOURS else {})}
+    return {NOTE: note, **({COLOUR: head_set.colour} if head_set else {})}

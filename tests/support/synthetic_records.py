@@ -168,7 +168,7 @@ def simulate_cell(cell, key, settings, world, seeds, rng, labels):
     """Return a complete result: curves, pictures, predictions whose accuracy is the last epoch's."""
     curves = policy_curves(cell, world, seeds, rng)
     parts = [_rows(np.arange(seeds), "policy", split, metric, values) for (split, metric), values in curves.items()]
-    heads = HEAD_SETS.get(cell.heads, ())  # the ceiling has no encoder
+    heads = HEAD_SETS[cell.heads].heads if cell.heads in HEAD_SETS else ()  # the ceiling has no encoder
     for split in ("train", "test") if heads else ():
         losses = {head: (0.05 + 0.4 * np.exp(-np.arange(settings.encoder.epochs) / 4))[None] for head in heads}
         parts += [_rows(np.array([NO_SEED]), "encoder", split, f"loss_{head}", loss) for head, loss in losses.items()]
