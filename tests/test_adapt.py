@@ -56,22 +56,22 @@ def thinned(episode, every):
 
 
 def test_a_whole_drive_at_10_hz_stays_as_it_is(drive):
-    made = adapt(drive, "drive")
-    assert (made.derived, made.skipped, made.egos) == (0, 0, 6)
-    assert made.episode.labels == "recorded"
-    assert np.array_equal(made.episode.x, drive.x)
-    assert np.array_equal(made.episode.steering, drive.steering)
+    adapted = adapt(drive, "drive")
+    assert (adapted.derived, adapted.skipped, adapted.egos) == (0, 0, 6)
+    assert adapted.episode.labels == "recorded"
+    assert np.array_equal(adapted.episode.x, drive.x)
+    assert np.array_equal(adapted.episode.steering, drive.steering)
 
 
 @pytest.mark.parametrize("every", [2, 4])
 def test_a_slower_log_comes_back_to_10_hz_near_where_it_was(drive, every):
-    made = adapt(thinned(drive, every), "drive").episode
-    steps = made.steps
-    assert made.rate_hz == 10
+    adapted = adapt(thinned(drive, every), "drive").episode
+    steps = adapted.steps
+    assert adapted.rate_hz == 10
     assert steps == (drive.steps - 1) // every * every + 1
-    assert np.abs(made.x - drive.x[:steps]).max() < 0.15 * every
-    assert np.array_equal(made.x[::every], drive.x[:steps:every])
-    assert np.array_equal(made.light_state, drive.light_state[np.arange(steps) // every * every])
+    assert np.abs(adapted.x - drive.x[:steps]).max() < 0.15 * every
+    assert np.array_equal(adapted.x[::every], drive.x[:steps:every])
+    assert np.array_equal(adapted.light_state, drive.light_state[np.arange(steps) // every * every])
 
 
 def test_headings_are_interpolated_the_short_way_round(drive):
@@ -84,8 +84,8 @@ def test_headings_are_interpolated_the_short_way_round(drive):
 def test_an_agent_is_there_between_steps_only_if_it_is_at_both(drive):
     present = drive.present.copy()
     present[20:, 0] = False
-    made = adapt(dataclasses.replace(drive, present=present, rate_hz=5.0), "drive").episode
-    assert np.flatnonzero(made.present[:, 0]).max() == 38
+    adapted = adapt(dataclasses.replace(drive, present=present, rate_hz=5.0), "drive").episode
+    assert np.flatnonzero(adapted.present[:, 0]).max() == 38
 
 
 def test_the_steering_unit_is_the_towns():
@@ -94,17 +94,17 @@ def test_the_steering_unit_is_the_towns():
 
 def test_derived_commands_are_those_of_the_autopilot(town):
     steering, acceleration = derived_commands(town)
-    seen = town.present & (town.speed > 2) & np.isfinite(steering)
-    assert np.median(np.abs(steering - town.steering)[seen]) < 0.005
-    assert np.corrcoef(steering[seen], town.steering[seen])[0, 1] > 0.9
-    assert (acceleration == town.acceleration)[seen].mean() > 0.8
+    moving = town.present & (town.speed > 2) & np.isfinite(steering)
+    assert np.median(np.abs(steering - town.steering)[moving]) < 0.005
+    assert np.corrcoef(steering[moving], town.steering[moving])[0, 1] > 0.9
+    assert (acceleration == town.acceleration)[moving].mean() > 0.8
 
 
 def test_where_nobody_has_commands_all_are_derived_and_marked(drive):
-    made = adapt(unlabelled(drive), "drive")
-    assert made.episode.labels == "derived"
-    assert made.derived == drive.present.sum()
-    assert made.egos == 6
+    adapted = adapt(unlabelled(drive), "drive")
+    assert adapted.episode.labels == "derived"
+    assert adapted.derived == drive.present.sum()
+    assert adapted.egos == 6
 
 
 def test_an_agent_without_commands_among_others_is_traffic(drive):
@@ -112,17 +112,17 @@ def test_an_agent_without_commands_among_others_is_traffic(drive):
     steering[:, 2] = acceleration[:, 2] = np.nan
     steering[10, 0] = np.nan  # one of both: derived
     steering[11, 1] = acceleration[11, 1] = np.nan  # neither: unknown
-    made = adapt(dataclasses.replace(drive, steering=steering, acceleration=acceleration), "drive")
-    assert [agent.ego for agent in made.episode.agents] == [True, True, False, True, True, True]
-    assert (made.derived, made.skipped, made.episode.labels) == (1, 1, "derived")
-    moments = valid_moments(made.episode, load_profile("smoke").birdview)
+    adapted = adapt(dataclasses.replace(drive, steering=steering, acceleration=acceleration), "drive")
+    assert [agent.ego for agent in adapted.episode.agents] == [True, True, False, True, True, True]
+    assert (adapted.derived, adapted.skipped, adapted.episode.labels) == (1, 1, "derived")
+    moments = valid_moments(adapted.episode, load_profile("smoke").birdview)
     assert not (moments[:, 1] == 2).any()
 
 
 def test_progress_follows_the_route(drive):
     unknown = np.full_like(drive.route_s, np.nan)
-    made = adapt(dataclasses.replace(drive, route_s=unknown), "drive").episode
-    assert np.abs(made.route_s - drive.route_s).max() < 0.3
+    adapted = adapt(dataclasses.replace(drive, route_s=unknown), "drive").episode
+    assert np.abs(adapted.route_s - drive.route_s).max() < 0.3
 
 
 def test_a_log_without_lights_or_routes_is_fine(drive):
@@ -134,9 +134,9 @@ def test_a_log_without_lights_or_routes_is_fine(drive):
         routes=tuple(route[:0] for route in drive.routes),
         route_s=np.full_like(drive.route_s, np.nan),
     )
-    made = adapt(bare, "drive").episode
-    assert np.isnan(made.route_s).all()
-    assert len(valid_moments(made, load_profile("smoke").birdview))
+    adapted = adapt(bare, "drive").episode
+    assert np.isnan(adapted.route_s).all()
+    assert len(valid_moments(adapted, load_profile("smoke").birdview))
 
 
 def test_headings_in_degrees_are_refused(drive):
@@ -175,11 +175,11 @@ def test_the_same_drives_give_the_same_bytes(folder, tmp_path):
 
 
 def test_what_was_imported_is_read_back(folder, tmp_path):
-    made = import_drives(folder, tmp_path / "out")
-    assert open_import(tmp_path / "out") == made
-    assert [drive.name for drive in made.drives] == [f"drive-{number:03d}" for number in range(4)]
-    assert {read_episode(tmp_path / "out" / drive.name).digest for drive in made.drives} == {
-        drive.digest for drive in made.drives
+    adapted = import_drives(folder, tmp_path / "out")
+    assert open_import(tmp_path / "out") == adapted
+    assert [drive.name for drive in adapted.drives] == [f"drive-{number:03d}" for number in range(4)]
+    assert {read_episode(tmp_path / "out" / drive.name).digest for drive in adapted.drives} == {
+        drive.digest for drive in adapted.drives
     }
 
 

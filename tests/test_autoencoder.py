@@ -207,19 +207,19 @@ def test_loss_is_the_weighted_sum_of_cross_entropies(frames: Frames) -> None:
     settings = EncoderSettings(head_weights={"rec": 2.0, "plan": 0.5})
     module = MultiHeadAutoencoder("full", settings, 0)
     batch = torch.tensor(frames.images[:8]), torch.tensor(frames.masks[:8])
-    found = dict(zip(module.metrics, module.losses(*batch).tolist(), strict=True))
+    losses = dict(zip(module.metrics, module.losses(*batch).tolist(), strict=True))
     plan = torch.from_numpy(unpack_masks(frames.masks[:8])[:, 1:]).float()
     pixels = batch[0].permute(0, 3, 1, 2) / 255
     with torch.no_grad():
         outputs = module(pixels)
-    assert found["loss_plan"] == pytest.approx(
+    assert losses["loss_plan"] == pytest.approx(
         float(functional.binary_cross_entropy(outputs["plan"].sigmoid(), plan)), rel=1e-4
     )
-    assert found["loss_rec"] == pytest.approx(
+    assert losses["loss_rec"] == pytest.approx(
         float(functional.binary_cross_entropy(outputs["rec"].sigmoid(), pixels)), rel=1e-4
     )
-    total = 2 * found["loss_rec"] + found["loss_pred"] + 0.5 * found["loss_plan"]
-    assert found["loss"] == pytest.approx(total, rel=1e-5)
+    total = 2 * losses["loss_rec"] + losses["loss_pred"] + 0.5 * losses["loss_plan"]
+    assert losses["loss"] == pytest.approx(total, rel=1e-5)
 
 
 def test_gradients_taken_head_by_head_are_those_of_the_total_loss(frames: Frames) -> None:
@@ -229,21 +229,23 @@ def test_gradients_taken_head_by_head_are_those_of_the_total_loss(frames: Frames
     module = MultiHeadAutoencoder("full", settings, 0)
     losses = dict(zip(module.metrics, module.gradients(images, masks, module._noise(16)).tolist(), strict=True))
 
-    whole = MultiHeadAutoencoder("full", settings, 0)
+    reference = MultiHeadAutoencoder("full", settings, 0)
     pixels, targets = images.permute(0, 3, 1, 2) / 255, unpack(masks, ["pred", "plan"])
-    features = whole.encoder.features(pixels)
-    mean, log_variance = whole.encoder.mean(features), whole.encoder.log_variance(features)
+    features = reference.encoder.features(pixels)
+    mean, log_variance = reference.encoder.mean(features), reference.encoder.log_variance(features)
     noise = networks.seeded_generator(0, "noise")
     z = mean + (log_variance / 2).exp() * torch.randn(mean.shape, generator=noise)
     normal = torch.distributions.Normal
     kl = torch.distributions.kl_divergence(normal(mean, (log_variance / 2).exp()), normal(0.0, 1.0))
     total = 0.3 * kl.sum(1).mean() / (3 * 64 * 64)
     for head, weight in (("rec", 2.0), ("pred", 1.0), ("plan", 0.5)):
-        loss = functional.binary_cross_entropy_with_logits(whole.decoders[head](z), (targets | {"rec": pixels})[head])
+        loss = functional.binary_cross_entropy_with_logits(
+            reference.decoders[head](z), (targets | {"rec": pixels})[head]
+        )
         total = total + weight * loss
     total.backward()
     assert losses["loss"] == pytest.approx(float(total.detach()), rel=1e-5)
-    for (name, ours), theirs in zip(module.named_parameters(), whole.parameters(), strict=True):
+    for (name, ours), theirs in zip(module.named_parameters(), reference.parameters(), strict=True):
         if theirs.grad is None:
             assert ours.grad is None, name
         else:
@@ -314,14 +316,14 @@ def test_an_epoch_takes_each_frame_once_in_even_batches(frames: Frames) -> None:
 
 def test_the_step_budget_keeps_the_steps_of_the_whole_data(frames: Frames) -> None:
     settings = SETTINGS.model_copy(update={"budget": "steps"})
-    whole = plan_training(frames, 1.0, 0, settings, FRAMES)
+    all_data = plan_training(frames, 1.0, 0, settings, FRAMES)
     quarter = plan_training(frames, 0.25, 0, settings, FRAMES)
-    assert quarter.steps == whole.steps
+    assert quarter.steps == all_data.steps
     times = np.unique(np.concatenate(quarter.parts(1)), return_counts=True)
     assert np.array_equal(times[0], quarter.subset)
     assert set(times[1]) == {4}
     literal = plan_training(frames, 0.25, 0, SETTINGS, FRAMES)
-    assert literal.steps == -(-whole.steps // 4)
+    assert literal.steps == -(-all_data.steps // 4)
     trained = train(frames, "rec", settings, fraction=0.25)
     assert trained.frames == len(quarter.subset)
     assert trained.curves["epoch"].max() == settings.epochs
@@ -393,18 +395,18 @@ def test_what_cannot_be_compiled_trains_without_after_one_warning(
 
 
 def test_inside_an_epoch_nobody_waits_for_the_device(frames: Frames, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = record_synchronisations(monkeypatch, MultiHeadAutoencoder, "training_step", "validation_step")
+    reads = record_synchronisations(monkeypatch, MultiHeadAutoencoder, "training_step", "validation_step")
     train(frames, "full", SETTINGS.model_copy(update={"beta": 0.5}))
-    assert asked == []
+    assert reads == []
 
 
 def test_memory_of_a_step_is_estimated_from_above(frames: Frames) -> None:
     """More than what autograd keeps and two of the largest gradients, and not more than twice as much."""
     for heads in ("rec", "full"):
-        kept: dict[int, int] = {}
+        storages: dict[int, int] = {}
 
-        def keep(tensor: torch.Tensor, kept: dict[int, int] = kept) -> torch.Tensor:
-            kept[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
+        def keep(tensor: torch.Tensor, storages: dict[int, int] = storages) -> torch.Tensor:
+            storages[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
             return tensor
 
         module = MultiHeadAutoencoder(heads, SETTINGS, 0)
@@ -412,7 +414,7 @@ def test_memory_of_a_step_is_estimated_from_above(frames: Frames) -> None:
         with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
             losses = module.losses(torch.tensor(frames.images[:32]), torch.tensor(frames.masks[:32]))
         assert losses.requires_grad
-        activations = sum(count for pointer, count in kept.items() if pointer not in weights)
+        activations = sum(count for pointer, count in storages.items() if pointer not in weights)
         estimate = training.step_bytes(heads, 32, "fp32") - training.SPARE_BYTES
         assert activations + 2 * 32 * 31 * 31 * 32 * 4 <= estimate <= 2.5 * activations
 

@@ -106,7 +106,7 @@ def test_another_car_is_yellow_where_the_ego_sees_it(heading, ahead, left):
 
 def test_a_left_turn_looks_like_a_left_turn():
     """The real ways of the crossing: plan goes left for cars that turn left, right for those that turn right."""
-    seen = set()
+    sides = set()
     for seed in range(6):
         episode = crossing_drive(seed)
         turned = np.zeros_like(episode.heading)
@@ -117,9 +117,9 @@ def test_a_left_turn_looks_like_a_left_turn():
                 far = np.flatnonzero(plan.any(axis=1))[0]
                 side = np.flatnonzero(plan[far]).mean() - 31.5
                 assert np.sign(side) == -np.sign(turned[step, agent])
-                seen.add(np.sign(side))
+                sides.add(np.sign(side))
                 break
-    assert seen == {-1, 1}
+    assert sides == {-1, 1}
 
 
 @pytest.mark.parametrize(("who", "colour"), [(0, [0, 0, 1]), (1, [1, 1, 0])])

@@ -75,8 +75,8 @@ def test_agents_in_view_are_those_whose_centre_is_painted(small_drives):
     for step, agent in labels.itertuples(index=False):
         place = episode.x[step] + 1j * episode.y[step]
         ego = [item.id for item in episode.agents].index(agent)
-        seen = (place - place[ego]) * np.exp(-1j * episode.heading[step, ego])
-        expected.append(int(((np.abs(seen.imag) < 20) & (seen.real > -15) & (seen.real < 25)).sum()) - 1)
+        relative = (place - place[ego]) * np.exp(-1j * episode.heading[step, ego])
+        expected.append(int(((np.abs(relative.imag) < 20) & (relative.real > -15) & (relative.real < 25)).sum()) - 1)
     assert _others(labels, small_drives[0], VIEW.model_dump()) == expected
     assert max(expected) > 0
 
@@ -98,22 +98,22 @@ def test_the_nearest_frame_is_the_one_a_search_finds():
 
 def test_a_split_by_frame_finds_the_twins_that_a_split_by_drive_keeps_apart():
     """Five drives that stand still at ten places each: every picture is there eight times, in its drive alone."""
-    shown = np.repeat(pictures(50), 8, axis=0)
+    images = np.repeat(pictures(50), 8, axis=0)
     labels = pd.DataFrame({"episode": np.repeat(np.arange(5), 80)})
-    found = _twins(Frames(shown, np.zeros((400, 2, MASK_BYTES), np.uint8), labels), 0.2, 0)
-    assert found["episode"]["twins"] == found["episode"]["same_drive"] == 0
-    assert found["frame"]["twins"] > 0.95
-    assert found["frame"]["same_drive"] > 0.95
-    assert found["frame"]["test"] == found["episode"]["test"] == 80
+    twins = _twins(Frames(images, np.zeros((400, 2, MASK_BYTES), np.uint8), labels), 0.2, 0)
+    assert twins["episode"]["twins"] == twins["episode"]["same_drive"] == 0
+    assert twins["frame"]["twins"] > 0.95
+    assert twins["frame"]["same_drive"] > 0.95
+    assert twins["frame"]["test"] == twins["episode"]["test"] == 80
 
 
 def test_frames_of_a_single_drive_are_split_by_frame_only(small_store, small_drives):
     card = make_card(open_frames(small_store), small_drives)
     labels = pd.DataFrame({"episode": np.zeros(50, int)})
-    found = _twins(Frames(pictures(50), np.zeros((50, 2, MASK_BYTES), np.uint8), labels), 0.2, 0)
-    assert "episode" not in found
-    assert found["frame"]["test"] == 10
+    twins = _twins(Frames(pictures(50), np.zeros((50, 2, MASK_BYTES), np.uint8), labels), 0.2, 0)
+    assert "episode" not in twins
+    assert twins["frame"]["test"] == 10
     for entry in card["sets"].values():
-        entry["twins"] = found
+        entry["twins"] = twins
     assert card_text(card).count("all frames are of one drive") == 2
     data_card(card)

@@ -86,12 +86,12 @@ def test_only_what_is_missing_or_damaged_is_made_again_and_is_what_it_was(new_jo
     weights = sorted(product_folders(job.scratch, job.key))[1] / "weights.safetensors"
     content = bytearray(weights.read_bytes())
     weights.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
-    told = []
-    second, _ = run_flow(cell_flow(job), progress=lambda *how: told.append(how))
+    steps = []
+    second, _ = run_flow(cell_flow(job), progress=lambda *how: steps.append(how))
     epochs = SETTINGS.policy.epochs
-    assert next(how for how in told if how[0] == "policy") == ("policy", 2, 3)
-    assert [how for how in told if how[0] == "policy"][-1] == ("policy", epochs, epochs)
-    assert "encoder" not in {how[0] for how in told}
+    assert next(how for how in steps if how[0] == "policy") == ("policy", 2, 3)
+    assert [how for how in steps if how[0] == "policy"][-1] == ("policy", epochs, epochs)
+    assert "encoder" not in {how[0] for how in steps}
     assert_same(first, second)
     assert weights.read_bytes() == content
 

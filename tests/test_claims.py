@@ -24,15 +24,15 @@ def test_true_claims_are_reproduced(heads):
 
 
 def test_true_claims_about_data_size_are_reproduced():
-    found = outcomes(simulate(DATASIZE_GRID, World(slower=0.0)))
-    assert [found[claim] for claim in ("D1", "D2", "D3", "D4")] == ["reproduced"] * 4
+    by_claim = outcomes(simulate(DATASIZE_GRID, World(slower=0.0)))
+    assert [by_claim[claim] for claim in ("D1", "D2", "D3", "D4")] == ["reproduced"] * 4
 
 
 def test_the_opposite_of_a_claim_is_not_reproduced():
     accuracy = dict(zip(HEAD_SETS, (0.88, 0.86, 0.84, 0.82), strict=True))
     record = simulate(HEADS_GRID, World(accuracy=accuracy, steering_effect=0.002))
-    found = outcomes(record)
-    assert [found[claim] for claim in ("H1", "H2", "H3", "H4")] == ["not reproduced"] * 4
+    by_claim = outcomes(record)
+    assert [by_claim[claim] for claim in ("H1", "H2", "H3", "H4")] == ["not reproduced"] * 4
 
 
 def test_the_largest_variance_is_found_when_it_is_far_the_largest():
@@ -65,10 +65,12 @@ def test_speed_is_no_evidence_where_the_baseline_is_as_fast():
 
 
 def test_claims_with_unfinished_cells_are_not_tested_and_name_them():
-    found = {v.claim: v for v in claims.judge(simulate(HEADS_GRID, World(epochs=12), unfinished=("rec+plan 100% e0",)))}
-    assert found["H2"].outcome == "not tested"
-    assert found["H2"].missing == ("rec+plan",)
-    assert found["H4"].outcome != "not tested"  # needs rec and full only
+    verdicts = {
+        v.claim: v for v in claims.judge(simulate(HEADS_GRID, World(epochs=12), unfinished=("rec+plan 100% e0",)))
+    }
+    assert verdicts["H2"].outcome == "not tested"
+    assert verdicts["H2"].missing == ("rec+plan",)
+    assert verdicts["H4"].outcome != "not tested"  # needs rec and full only
 
 
 def test_one_policy_is_no_evidence():
@@ -155,8 +157,8 @@ def test_a_null_study_claims_no_effect(grid, null, draws, monkeypatch):
 def test_a_difference_that_encoders_alone_make_is_found_by_the_rate():
     """The null study's own check: without an allowance, one encoder each, other encoders pass for effects."""
     grid = HEADS_GRID.model_copy(update={"rules": FREE})
-    found = [
+    claimed = [
         claims_an_effect(next(v for v in claims.weigh(OTHER_ENCODERS.evidence(grid, seed)) if v.claim == "H3"))
         for seed in range(10)
     ]
-    assert sum(found) > 5
+    assert sum(claimed) > 5

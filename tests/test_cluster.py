@@ -82,9 +82,9 @@ class Cluster:
 
 @pytest.fixture
 def cluster(tmp_path):
-    made = Cluster(tmp_path)
-    yield made
-    made.stop()
+    machines = Cluster(tmp_path)
+    yield machines
+    machines.stop()
 
 
 def test_three_machines_and_many_kills_end_with_the_table_of_one(undisturbed, cluster, tmp_path):
@@ -137,11 +137,11 @@ def test_certificates_that_do_not_match_are_one_clear_error(cluster, tmp_path):
     folder = working_folder(tmp_path / "client")
     other = make_certificates(tmp_path / "other")
     words = ["heads", "--profile", "tiny", "--cluster", cluster.address, "--certificates"]
-    done = sweep(folder, *words, str(other))
-    assert done.returncode == 2
-    assert "no Dask scheduler answers" in done.stderr
-    assert "Traceback" not in done.stderr
-    assert str(other) not in done.stdout
+    completed = sweep(folder, *words, str(other))
+    assert completed.returncode == 2
+    assert "no Dask scheduler answers" in completed.stderr
+    assert "Traceback" not in completed.stderr
+    assert str(other) not in completed.stdout
 
 
 YAML = "class: {name}\narguments: {{cores: 1, memory: 2GB}}\nworkers: 2\n"
@@ -150,7 +150,7 @@ YAML = "class: {name}\narguments: {{cores: 1, memory: 2GB}}\nworkers: 2\n"
 def test_a_batch_system_that_is_not_there_is_one_clear_error(tmp_path):
     folder = working_folder(tmp_path / "client")
     (folder / "slurm.yaml").write_text(YAML.format(name="SLURMCluster"))
-    done = sweep(folder, "heads", "--profile", "tiny", "--cluster", "slurm.yaml")
-    assert done.returncode == 2
-    assert "sbatch, which is not on this machine" in done.stderr
-    assert "Traceback" not in done.stderr
+    completed = sweep(folder, "heads", "--profile", "tiny", "--cluster", "slurm.yaml")
+    assert completed.returncode == 2
+    assert "sbatch, which is not on this machine" in completed.stderr
+    assert "Traceback" not in completed.stderr

@@ -45,19 +45,19 @@ def folder(tmp_path_factory):
     ],
 )
 def test_bad_input_is_one_clear_error_exit_code_2_and_leaves_nothing(folder, words, expected):
-    done = sweep(folder, *words)
-    assert done.returncode == 2
-    assert expected in done.stderr
-    assert "secret" not in done.stderr
-    assert "Traceback" not in done.stderr
+    completed = sweep(folder, *words)
+    assert completed.returncode == 2
+    assert expected in completed.stderr
+    assert "secret" not in completed.stderr
+    assert "Traceback" not in completed.stderr
     assert {path.name for path in folder.iterdir()} == {"sweeps"}
 
 
 def test_dry_run_speaks_json(folder):
-    done = sweep(
+    completed = sweep(
         folder, "heads", "--dry-run", "--json", "--profile", "smoke", "--heads", "full", "--encoder_seeds", "2"
     )
-    facts = json.loads(done.stdout)
+    facts = json.loads(completed.stdout)
     assert set(facts) == {
         "sweep",
         "profile",
@@ -84,8 +84,8 @@ def test_help_and_dry_run_load_nothing_heavy(folder, words):
         "except SystemExit: pass\n"
         f"print([name for name in {HEAVY!r} if name in sys.modules], file=sys.stderr)"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=folder)
-    assert done.stderr.strip() == "[]"
+    completed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=folder)
+    assert completed.stderr.strip() == "[]"
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -124,8 +124,8 @@ def test_work_that_does_not_ask_is_left_where_it_is():
         "stoppable(work, 'this again')"
     )
     began = time.monotonic()
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.returncode == EXIT_INTERRUPTED
-    assert "To go on: this again" in done.stderr
-    assert "Traceback" not in done.stderr
+    completed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert completed.returncode == EXIT_INTERRUPTED
+    assert "To go on: this again" in completed.stderr
+    assert "Traceback" not in completed.stderr
     assert STOP_SECONDS <= time.monotonic() - began < 30

@@ -64,8 +64,8 @@ def test_scores_stand_side_by_side_with_the_difference_and_its_interval(pair, te
     shift = second.accuracy.mean - first.accuracy.mean
     assert cells[1] == f"{100 * first.accuracy.mean:.2f} (15)"
     assert cells[3] == f"\N{MINUS SIGN}{-100 * shift:.2f}"
-    found = difference(first.accuracy, second.accuracy)
-    assert found.low < shift < found.high < 0
+    gap = difference(first.accuracy, second.accuracy)
+    assert gap.low < shift < gap.high < 0
 
 
 def test_the_share_of_the_possible_gain_stands_beside_with_floor_and_ceiling(pair, text):
@@ -81,10 +81,10 @@ def test_the_share_of_the_possible_gain_stands_beside_with_floor_and_ceiling(pai
 def test_a_report_without_a_ceiling_or_of_a_time_before_it_is_compared_without_shares(content):
     old = {name: value for name, value in content.items() if name != "ceiling"}
     old["scores"] = [{name: value for name, value in score.items() if name != "share"} for score in old["scores"]]
-    whole, before = checked(content, "new"), checked(old, "old")
-    text = compared(whole, before, ("new", "old"))
+    complete, before = checked(content, "new"), checked(old, "old")
+    text = compared(complete, before, ("new", "old"))
     assert "share of gain" not in text
-    assert row(text, "*ceiling (true state)*")[1:] == [f"{100 * whole.ceiling.mean:.2f} (4)", *["\N{EM DASH}"] * 3]
+    assert row(text, "*ceiling (true state)*")[1:] == [f"{100 * complete.ceiling.mean:.2f} (4)", *["\N{EM DASH}"] * 3]
     assert "ceiling" not in compared(before, before, ("old", "old"))
 
 
@@ -131,8 +131,8 @@ def test_a_sweep_beside_itself_differs_in_nothing(pair):
 
 
 def test_cells_of_one_sweep_only_are_named(content):
-    whole = checked(made(simulate(HEADS_GRID, FAST)), "whole")
-    text = compared(checked(content, "part"), whole, ("part", "whole"))
+    complete = checked(made(simulate(HEADS_GRID, FAST)), "whole")
+    text = compared(checked(content, "part"), complete, ("part", "whole"))
     assert "Only in the second: rec+pred, rec+plan." in text
     assert row(text, "100 %")[3] == "the same"
 

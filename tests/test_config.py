@@ -107,7 +107,7 @@ def test_the_budget_matters_below_the_full_data_only():
         {encoder_key(settings, Cell(heads="rec", fraction=fraction), "f") for settings in (one, other)}
         for fraction in (1.0, 0.5)
     ]
-    assert [len(found) for found in keys] == [1, 2]
+    assert [len(each) for each in keys] == [1, 2]
 
 
 @pytest.mark.parametrize(
@@ -146,13 +146,15 @@ def test_wrong_settings_are_explained(overrides, words):
 def test_a_rule_is_one_number_or_one_for_each_profile(tmp_path):
     file = tmp_path / "own.yaml"
     file.write_text("title: T\nheads: [rec]\nrules: {alpha: 0.1, encoder_allowance: {smoke: 0.2, laptop: 0.02}}\n")
-    found = {name: load_grid("own", folder=tmp_path, profile=name).rules for name in ("smoke", "laptop", "mine")}
-    assert {name: rules.encoder_allowance for name, rules in found.items()} == {
+    rules_by_profile = {
+        name: load_grid("own", folder=tmp_path, profile=name).rules for name in ("smoke", "laptop", "mine")
+    }
+    assert {name: rules.encoder_allowance for name, rules in rules_by_profile.items()} == {
         "smoke": 0.2,
         "laptop": 0.02,
         "mine": 0.2,  # not named: the largest
     }
-    assert {rules.alpha for rules in found.values()} == {0.1}
+    assert {rules.alpha for rules in rules_by_profile.values()} == {0.1}
 
 
 @pytest.mark.parametrize("allowance", ["{}", "{smoke: much}", "{smoke: -1, laptop: -2}", "many"])

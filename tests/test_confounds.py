@@ -84,8 +84,8 @@ def test_what_matters_below_all_the_data_is_shown_there_only():
 
 def test_welchs_interval_covers_a_true_difference():
     rng = np.random.default_rng(0)
-    found = [comparisons.welch(rng.normal(0.3, 1, 15), rng.normal(0, 2, 8)) for _ in range(800)]
-    assert 0.93 < np.mean([each.low < 0.3 < each.high for each in found]) < 0.97
+    intervals = [comparisons.welch(rng.normal(0.3, 1, 15), rng.normal(0, 2, 8)) for _ in range(800)]
+    assert 0.93 < np.mean([each.low < 0.3 < each.high for each in intervals]) < 0.97
 
 
 def test_a_sweep_without_variants_lists_how_to_run_each(tmp_path):

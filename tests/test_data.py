@@ -30,9 +30,9 @@ def settings():
 
 @pytest.fixture(scope="module")
 def root(settings, tmp_path_factory):
-    made = tmp_path_factory.mktemp("data")
-    run_flow(data_flow(settings, made))
-    return made
+    folder = tmp_path_factory.mktemp("data")
+    run_flow(data_flow(settings, folder))
+    return folder
 
 
 def test_the_two_sets_come_from_different_drives(settings, root):
@@ -57,15 +57,15 @@ def test_drives_and_frames_are_the_same_bytes_whoever_makes_them(settings, root,
 
 
 def test_what_is_there_is_not_made_again(settings, root):
-    told = []
-    run_flow(data_flow(settings, root), progress=lambda *what: told.append(what))
-    assert told == []
+    steps = []
+    run_flow(data_flow(settings, root), progress=lambda *what: steps.append(what))
+    assert steps == []
 
 
 def test_progress_reaches_the_end(settings, tmp_path):
-    told = []
-    run_flow(data_flow(settings, tmp_path), progress=lambda *what: told.append(what))
-    assert [stage for stage, done, whole in told if done == whole] == ["record", "select", "render"]
+    steps = []
+    run_flow(data_flow(settings, tmp_path), progress=lambda *what: steps.append(what))
+    assert [stage for stage, done, total in steps if done == total] == ["record", "select", "render"]
 
 
 def test_drives_that_are_there_need_no_simulator(settings, root, tmp_path, monkeypatch):

@@ -127,8 +127,8 @@ def test_a_result_that_cannot_travel_fails_its_flow_only(engine):
 
 def test_accelerated_tasks_run_where_the_gpu_is_seen(engine):
     assert engine.gpus() == 1
-    seen = run_flow(flow(environment, *[("CUDA_VISIBLE_DEVICES",)] * 4, accelerated=True), engine)
-    assert seen == [GPU] * 4
+    visible = run_flow(flow(environment, *[("CUDA_VISIBLE_DEVICES",)] * 4, accelerated=True), engine)
+    assert visible == [GPU] * 4
 
 
 def test_a_gpu_whose_worker_restarts_is_waited_for(engine, tmp_path, monkeypatch):

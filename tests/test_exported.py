@@ -93,8 +93,8 @@ def test_the_network_runs_where_there_is_only_torch(file, tmp_path):
         f"import sys, torch; driver = torch.export.load({str(file)!r}).module();"
         "print(tuple(driver(torch.zeros(4, 3, 64, 64))['acceleration'].shape), 'study' in sys.modules)"
     )
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == f"({SEEDS}, 4, 3) False"
+    completed = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert completed.stdout.strip() == f"({SEEDS}, 4, 3) False"
 
 
 def test_no_weight_is_pickled(file):

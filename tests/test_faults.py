@@ -63,7 +63,7 @@ def test_a_storm_of_kills_changes_nothing(undisturbed, tmp_path):  # noqa: C901 
     """SIGKILL at random moments of every stage, to the client and to workers."""
     rng = random.Random("storm")
     folder = working_folder(tmp_path)
-    kills, kept, run = Counter(), set(), None
+    kills, finished_before, run = Counter(), set(), None
     for phase in BLOWS:
         blows = [(stage, role) for stage, role, times in phase for _ in range(times)]
         rng.shuffle(blows)
@@ -84,7 +84,7 @@ def test_a_storm_of_kills_changes_nothing(undisturbed, tmp_path):  # noqa: C901 
                 if run.wait() == 0 and stage != "report":  # every cell is finished: nothing is left to be hit there
                     for path in ("mlruns/mlflow.db", "data/products", "data/encoders"):
                         remove(folder / path)
-                    kept = set()
+                    finished_before = set()
                 continue
             if over():
                 for path in folder.glob("data/frames/*"):
@@ -100,9 +100,9 @@ def test_a_storm_of_kills_changes_nothing(undisturbed, tmp_path):  # noqa: C901 
                 blows.pop()
             if role == "client":
                 run.wait()
-                found = set(run_database(folder).result_folders())
-                assert kept <= found, "a finished cell was lost"
-                kept = found
+                finished = set(run_database(folder).result_folders())
+                assert finished_before <= finished, "a finished cell was lost"
+                finished_before = finished
     if run is not None:
         run.wait()
     run = CommandProcess(folder, *sweep_command(*FOUR_CELLS))
@@ -282,13 +282,13 @@ def test_a_tracking_server_that_is_away_for_a_while_costs_nothing(undisturbed, t
     server = TrackingServer(tmp_path / "server", f"sqlite:///{tmp_path}/server.db")
     try:
         run = CommandProcess(folder, *sweep_command(*TWO), "--tracking", server.uri)
-        kept = RunDatabase(tmp_path / "server.db", tmp_path / "server/files")
-        assert run.wait_for(lambda: kept.cell_counts()["RUNNING"]), run.output
+        database = RunDatabase(tmp_path / "server.db", tmp_path / "server/files")
+        assert run.wait_for(lambda: database.cell_counts()["RUNNING"]), run.output
         server.stop()
         time.sleep(20)
         server.start()
         assert run.wait() == 0, run.output
-        assert_same_outcome(folder, undisturbed.folder, kept)
+        assert_same_outcome(folder, undisturbed.folder, database)
     finally:
         server.stop()
 
@@ -321,9 +321,9 @@ class SmallDisk:
 
 @pytest.fixture
 def disk(tmp_path):
-    made = SmallDisk(tmp_path / "disk")
-    yield made
-    made.remove()
+    small_disk = SmallDisk(tmp_path / "disk")
+    yield small_disk
+    small_disk.remove()
 
 
 def test_a_full_disk_is_told_at_every_stage_and_costs_nothing(undisturbed, disk, tmp_path):

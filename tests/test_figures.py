@@ -108,12 +108,12 @@ def test_saved_files_are_svg_and_png_and_nothing_is_left_beside_them(heads_figur
 
 def test_a_figure_is_written_whole_in_the_format_of_its_ending(tmp_path):
     for ending, start in ((".svg", b"<?xml"), (".PNG", b"\x89PNG"), (".pdf", b"%PDF")):
-        made = []
+        contents = []
         for name in ("one", "two"):
             style.write(differences.confusions([("rec", np.eye(3))]), tmp_path / f"{name}{ending}")
-            made.append((tmp_path / f"{name}{ending}").read_bytes())
-        assert made[0].startswith(start)
-        assert made[0] == made[1]
+            contents.append((tmp_path / f"{name}{ending}").read_bytes())
+        assert contents[0].startswith(start)
+        assert contents[0] == contents[1]
     assert len(list(tmp_path.iterdir())) == 6
 
 
@@ -151,8 +151,8 @@ def test_a_sweep_gets_every_figure_of_the_paper_with_n_in_the_caption(grid, name
     drawings = {drawing.name: drawing for drawing in draw(record, summarise(record))}
     assert names <= set(drawings)
     for name in names - {"single_head_rec", "multi_results", "latent_maps", "all_head_sets"}:
-        wanted = "n = 3 encoders x 5 policies" if name == "by_encoder" else "n = 15 policies"
-        assert wanted in drawings[name].caption
+        expected = "n = 3 encoders x 5 policies" if name == "by_encoder" else "n = 15 policies"
+        assert expected in drawings[name].caption
     assert all(drawing.alt for drawing in drawings.values())
 
 
@@ -201,12 +201,12 @@ def marks(axes):
 
 def test_two_sweeps_differ_by_marker_and_fill_and_share_the_head_sets_colours(two, reports):
     left, right = two.figure.axes
-    wanted = {
+    expected = {
         (round(100 * score.accuracy.mean, 6), *mark)
         for report, mark in zip(reports, (("o", True), ("D", False)), strict=True)
         for score in report.scores
     }
-    assert marks(left) == wanted
+    assert marks(left) == expected
     gains = {
         (round(100 * report.above_baseline(point).value, 6), *mark)
         for report, mark in zip(reports, (("o", True), ("D", False)), strict=True)

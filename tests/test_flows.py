@@ -297,11 +297,11 @@ def test_progress_counts_the_weights_and_what_was_done_before():
 
 def test_progress_that_tasks_report_is_told_in_their_own_steps():
     halves = [("progress", 5, 20), ("progress", 20, 20)]
-    told = run({"a": iter_batch(reporting(halves, halves, weights=[3, 1]))}).steps
-    assert told[1:] == [("policy", part, 20) for part in (3, 15, 15, 16, 20, 20)]
+    steps = run({"a": iter_batch(reporting(halves, halves, weights=[3, 1]))}).steps
+    assert steps[1:] == [("policy", part, 20) for part in (3, 15, 15, 16, 20, 20)]
 
 
 def test_run_flow_tells_progress_by_stage():
-    told = []
-    run_flow(iter_batch(reporting([("progress", 1, 2)])), progress=lambda *how: told.append(how))
-    assert told == [("policy", 0, 1), ("policy", 1, 2), ("policy", 2, 2)]
+    steps = []
+    run_flow(iter_batch(reporting([("progress", 1, 2)])), progress=lambda *how: steps.append(how))
+    assert steps == [("policy", 0, 1), ("policy", 1, 2), ("policy", 2, 2)]

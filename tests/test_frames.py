@@ -49,8 +49,8 @@ def store(built, tmp_path):
 
 def test_frames_are_the_rendered_moments_of_their_labels(built, drives):
     """Every seventh row of both sets against the Episode it names."""
-    opened = open_frames(built, check=True)
-    for frames, paths in ((opened.encoder, drives[0]), (opened.policy, drives[1])):
+    frame_store = open_frames(built, check=True)
+    for frames, paths in ((frame_store.encoder, drives[0]), (frame_store.policy, drives[1])):
         assert list(frames.labels.columns) == list(LABELS)
         for row in range(0, len(frames), 7):
             label = frames.labels.iloc[row]
@@ -131,11 +131,11 @@ def test_a_killed_build_goes_on_and_ends_the_same(built, drives, tmp_path, stage
     assert not folder.exists()
     if stage == "render":
         (folder.with_name(".store.building") / "parts" / "encoder-000000000.draft").write_text('{"start": 0, "ro')
-    seen = []
-    run_flow(frames_flow(FRAMES, VIEW, *drives, folder), progress=lambda *what: seen.append(what))
+    steps = []
+    run_flow(frames_flow(FRAMES, VIEW, *drives, folder), progress=lambda *what: steps.append(what))
     if stage == "render":
-        assert seen[0][0] == "render"
-        assert seen[0][1] >= done
+        assert steps[0][0] == "render"
+        assert steps[0][1] >= done
     assert open_frames(folder, check=True).manifest == open_frames(built).manifest
 
 
@@ -145,8 +145,8 @@ def test_an_unfinished_build_of_other_settings_is_not_taken_up(drives, tmp_path)
     script.write_text(KILLED)
     start(script, tmp_path / "store", "render", 100, 1, drives).wait(timeout=120)
     run_flow(frames_flow(FRAMES.model_copy(update={"seed": 1}), VIEW, *drives, tmp_path / "store"))
-    opened = open_frames(tmp_path / "store", check=True)
-    assert opened.manifest["settings"]["frames"]["seed"] == 1
+    frame_store = open_frames(tmp_path / "store", check=True)
+    assert frame_store.manifest["settings"]["frames"]["seed"] == 1
 
 
 @pytest.mark.stress

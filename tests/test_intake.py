@@ -101,12 +101,12 @@ def test_an_import_that_was_stopped_goes_on_and_commits_every_cell_once(here, pl
 def test_what_is_missing_is_listed_and_not_trained(here, plan, folder, empty_store, capsys):
     (here / "mlruns").mkdir()
     shutil.copy(empty_store, here / "mlruns")
-    gone, there = plan.cells
-    shutil.rmtree(folder / gone)
+    missing, present = plan.cells
+    shutil.rmtree(folder / missing)
     assert main([*PLAN, "--import-results", str(folder)]) == 0
     said = capsys.readouterr().err
-    assert f"missing: rec 100% e0 ({gone})" in said
-    assert f"full 100% e0 ({there}): imported" in said
+    assert f"missing: rec 100% e0 ({missing})" in said
+    assert f"full 100% e0 ({present}): imported" in said
     assert run_database(here).cell_counts() == {"FINISHED": 1}
     assert not (here / "data").exists()
 

@@ -75,9 +75,9 @@ def api(server, path, **body):
 
 @pytest.fixture(scope="module")
 def experiment(server, sweep):
-    found = api(server, "experiments/search", max_results=10, order_by=["last_update_time DESC"])["experiments"]
-    (mine,) = [each for each in found if each["name"] == "study"]
-    return mine["experiment_id"], {tag["key"]: tag["value"] for tag in mine["tags"]}
+    response = api(server, "experiments/search", max_results=10, order_by=["last_update_time DESC"])["experiments"]
+    (study,) = [each for each in response if each["name"] == "study"]
+    return study["experiment_id"], {tag["key"]: tag["value"] for tag in study["tags"]}
 
 
 @pytest.fixture(scope="module")
@@ -88,8 +88,8 @@ def address(server, experiment):
 
 
 def runs(server, experiment, query):
-    found = api(server, "runs/search", experiment_ids=[experiment[0]], filter=query, max_results=100)["runs"]
-    return {run["info"]["run_name"]: run for run in found}
+    response = api(server, "runs/search", experiment_ids=[experiment[0]], filter=query, max_results=100)["runs"]
+    return {run["info"]["run_name"]: run for run in response}
 
 
 @pytest.fixture(scope="module")
@@ -106,15 +106,15 @@ def test_the_view_lists_the_cells_with_all_that_its_columns_name(cells, experime
     wanted = json.loads(experiment[1]["mlflow.sharedViewState.cells"])["selectedColumns"]
     assert [re.search("`(.+)`", column).group(1) for column in wanted][:6] == list(COLUMNS)
     for name, run in cells.items():
-        there = {
+        columns = {
             f"{kind}.`{item['key']}`": item["value"]
             for kind in ("params", "metrics", "tags")
             for item in run["data"][kind]
         }
-        assert set(wanted) <= set(there)
-        assert there["params.`heads`"] == name.split()[0]
-        assert there["tags.`state`"] == "finished"
-        assert len(str(there["metrics.`final/acceleration_accuracy`"])) <= len("0.12345")
+        assert set(wanted) <= set(columns)
+        assert columns["params.`heads`"] == name.split()[0]
+        assert columns["tags.`state`"] == "finished"
+        assert len(str(columns["metrics.`final/acceleration_accuracy`"])) <= len("0.12345")
         assert "mlflow.note.content" in {tag["key"] for tag in run["data"]["tags"]}
 
 
@@ -133,8 +133,8 @@ def test_a_comparison_of_the_cells_gets_a_whole_mean_curve_of_each(server, cells
 
 def test_report_figures_card_and_manifest_are_served(server, sweep):
     def files(path):
-        found = api(server, f"artifacts/list?run_id={sweep}&path={path}").get("files", [])
-        return {Path(file["path"]).name for file in found}
+        response = api(server, f"artifacts/list?run_id={sweep}&path={path}").get("files", [])
+        return {Path(file["path"]).name for file in response}
 
     assert {"report", "figures", "data", "data.json", "plan.json"} <= files("")
     assert files("data") == {"card.json", "card.txt", "card.png"}
@@ -145,10 +145,10 @@ def test_report_figures_card_and_manifest_are_served(server, sweep):
 
 
 def test_each_cell_has_its_model(server, experiment, cells):
-    found = api(server, "logged-models/search", experiment_ids=[experiment[0]])["models"]
-    sources = {model["info"]["source_run_id"] for model in found}
+    response = api(server, "logged-models/search", experiment_ids=[experiment[0]])["models"]
+    sources = {model["info"]["source_run_id"] for model in response}
     assert sources == {run["info"]["run_id"] for run in cells.values()}
-    assert {model["info"]["status"] for model in found} == {"LOGGED_MODEL_READY"}
+    assert {model["info"]["status"] for model in response} == {"LOGGED_MODEL_READY"}
 
 
 def test_a_model_comes_back_from_the_server(server, cells, monkeypatch):

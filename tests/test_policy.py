@@ -111,10 +111,10 @@ def test_all_seeds_as_one_group_come_out_as_one_group_each(
 
 def test_inside_an_epoch_nobody_waits_for_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
     """The way of a GPU: no number leaves it before the epoch's end."""
-    asked = record_synchronisations(monkeypatch, ensemble.PolicyEnsemble, "training_step")
+    reads = record_synchronisations(monkeypatch, ensemble.PolicyEnsemble, "training_step")
     monkeypatch.setattr(ensemble, "_groups", lambda seeds, device: [slice(0, seeds)])
     train()
-    assert asked == []
+    assert reads == []
 
 
 def test_training_leaves_the_number_of_threads_as_it_was() -> None:
@@ -182,10 +182,10 @@ def test_dropout_keeps_the_mean() -> None:
     words = [
         torch.from_numpy(np.random.default_rng(k).integers(-(2**31), 2**31, (1, rows * 2), np.int32)) for k in (0, 1)
     ]
-    seen = []
+    hidden = []
 
     def keep(outputs: torch.Tensor) -> torch.Tensor:
-        seen.append(outputs)
+        hidden.append(outputs)
         return outputs
 
     forward_backward(
@@ -195,10 +195,10 @@ def test_dropout_keeps_the_mean() -> None:
         keep,
         Scratch(),
     )
-    assert abs(seen[0].mean().item() - 1) < 5 / (rows * width) ** 0.5
+    assert abs(hidden[0].mean().item() - 1) < 5 / (rows * width) ** 0.5
     second = Layer(torch.full((1, width, width), 1 / width), torch.zeros(1, 1, width), *gradients)
     forward_backward([Layer(zero, one, *gradients), second, last], torch.zeros(1, rows, width), words, keep, Scratch())
-    assert abs(seen[1].mean().item() - 1) < 5 * (2 / (rows * width)) ** 0.5
+    assert abs(hidden[1].mean().item() - 1) < 5 * (2 / (rows * width)) ** 0.5
 
 
 # --- against torch's own layers -------------------------------------------------------------------------------------
@@ -301,11 +301,11 @@ def test_curves_hold_every_seed_epoch_split_and_metric_once(fifteen: TrainedPoli
 
 
 def test_log_and_progress_hear_of_every_epoch_and_of_the_mean_over_seeds() -> None:
-    heard, steps = [], []
-    policies = train(log=lambda *what: heard.append(what), progress=lambda *what: steps.append(what))
-    assert [epoch for epoch, _ in heard] == list(range(1, SETTINGS.epochs + 1))
+    logs, steps = [], []
+    policies = train(log=lambda *what: logs.append(what), progress=lambda *what: steps.append(what))
+    assert [epoch for epoch, _ in logs] == list(range(1, SETTINGS.epochs + 1))
     assert steps == [(epoch, SETTINGS.epochs) for epoch in range(1, SETTINGS.epochs + 1)]
-    assert heard[-1][1]["test/cross_entropy"] == pytest.approx(score(policies, "cross_entropy").mean(), rel=1e-5)
+    assert logs[-1][1]["test/cross_entropy"] == pytest.approx(score(policies, "cross_entropy").mean(), rel=1e-5)
 
 
 def test_predict_repeats_the_stored_predictions_from_the_stored_weights(fifteen: TrainedPolicies) -> None:

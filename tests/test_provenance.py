@@ -29,21 +29,21 @@ def checkout(tmp_path):
 
 
 def test_a_clean_checkout_is_its_commit(checkout):
-    found = provenance(checkout)
-    assert found["commit"] == git(checkout, "rev-parse", "HEAD").stdout.strip()
-    assert (found["dirty"], found["diff"], found["diff_digest"]) == (False, "", None)
-    assert len(found["lock"]) == 64
+    facts = provenance(checkout)
+    assert facts["commit"] == git(checkout, "rev-parse", "HEAD").stdout.strip()
+    assert (facts["dirty"], facts["diff"], facts["diff_digest"]) == (False, "", None)
+    assert len(facts["lock"]) == 64
 
 
 def test_changes_and_new_source_files_are_in_the_diff_and_the_index_stays(checkout):
     (checkout / "study" / "a.py").write_text("A = 2\n")
     (checkout / "study" / "b.py").write_text("B = 3\n")
     before = git(checkout, "status", "--porcelain").stdout
-    found = provenance(checkout)
-    assert found["dirty"]
-    assert "+A = 2" in found["diff"]
-    assert "+B = 3" in found["diff"]
-    assert len(found["diff_digest"]) == 64
+    facts = provenance(checkout)
+    assert facts["dirty"]
+    assert "+A = 2" in facts["diff"]
+    assert "+B = 3" in facts["diff"]
+    assert len(facts["diff_digest"]) == 64
     assert git(checkout, "status", "--porcelain").stdout == before
 
 
@@ -61,10 +61,10 @@ def test_a_huge_diff_is_cut_and_says_so(checkout):
 
 
 def test_outside_a_checkout_the_rest_is_known(tmp_path):
-    found = provenance(tmp_path)
-    assert (found["commit"], found["lock"], found["diff"]) == (None, None, "")
-    assert found["packages"]["numpy"]
-    assert found["cores"] >= 1
+    facts = provenance(tmp_path)
+    assert (facts["commit"], facts["lock"], facts["diff"]) == (None, None, "")
+    assert facts["packages"]["numpy"]
+    assert facts["cores"] >= 1
 
 
 def test_a_copy_made_by_git_archive_knows_its_commit(checkout, tmp_path_factory):
@@ -80,8 +80,8 @@ def test_a_copy_made_by_git_archive_knows_its_commit(checkout, tmp_path_factory)
 
 def test_a_checkout_around_the_code_is_not_its_own(checkout):
     (checkout / "study" / "a.py").write_text("A = 2\n")
-    found = provenance(checkout / "study")
-    assert (found["commit"], found["dirty"]) == (None, False)
+    facts = provenance(checkout / "study")
+    assert (facts["commit"], facts["dirty"]) == (None, False)
 
 
 def test_no_user_or_host_name_is_told(checkout):

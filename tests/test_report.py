@@ -70,32 +70,32 @@ def elements(node):
     """Yield a tagged PDF's structure elements below a node."""
     kids = node.get("/K", [])
     for kid in kids if isinstance(kids, list) else [kids]:
-        found = kid.get_object() if hasattr(kid, "get_object") else kid
-        if hasattr(found, "get"):
-            yield found
-            yield from elements(found)
+        element = kid.get_object() if hasattr(kid, "get_object") else kid
+        if hasattr(element, "get"):
+            yield element
+            yield from elements(element)
 
 
 def test_json_holds_every_claim_and_score_and_no_word_for_infinity(built):
     text = (built[1] / "heads" / "report.json").read_text()
-    found = json.loads(text, parse_constant=lambda word: pytest.fail(f"{word} is no JSON"))
-    assert [claim["claim"] for claim in found["claims"]] == ["H1", "H2", "H3", "H4", "H5"]
-    assert [score["heads"] for score in found["scores"]] == ["rec", "rec+pred", "rec+plan", "full"]
-    assert {score["n"] for score in found["scores"]} == {15}
-    for claim in found["claims"]:
+    content = json.loads(text, parse_constant=lambda word: pytest.fail(f"{word} is no JSON"))
+    assert [claim["claim"] for claim in content["claims"]] == ["H1", "H2", "H3", "H4", "H5"]
+    assert [score["heads"] for score in content["scores"]] == ["rec", "rec+pred", "rec+plan", "full"]
+    assert {score["n"] for score in content["scores"]} == {15}
+    for claim in content["claims"]:
         for finding in claim["findings"]:
             assert finding["estimate"]["n"] > 0
             assert finding["estimate"]["kind"]
 
 
 def test_numbers_in_the_pdf_are_those_of_the_json(built):
-    found = json.loads((built[1] / "heads" / "report.json").read_text())
+    content = json.loads((built[1] / "heads" / "report.json").read_text())
     text = pdf_text(built[2])
-    for score in found["scores"]:
+    for score in content["scores"]:
         row = f"{100 * score['accuracy']['mean']:.1f} +{100 * score['accuracy']['sd']:.2f}"
         assert re.search(row, text)
-    assert f"{100 * found['floor']['accuracy']:.1f} %" in text
-    for claim in found["claims"]:
+    assert f"{100 * content['floor']['accuracy']:.1f} %" in text
+    for claim in content["claims"]:
         assert claim["outcome"] in text
 
 
@@ -151,16 +151,16 @@ def test_a_sweep_without_any_result_still_gives_a_report(tmp_path):
 )
 def test_other_grids_give_reports_too(grid, tmp_path):
     pdf = build_report(simulate(grid, World(epochs=6)), tmp_path)
-    found = json.loads((tmp_path / grid.name / "report.json").read_text())
-    assert found["sweep"]["design"] == ("B" if grid.encoder_seeds > 1 else "A")
+    content = json.loads((tmp_path / grid.name / "report.json").read_text())
+    assert content["sweep"]["design"] == ("B" if grid.encoder_seeds > 1 else "A")
     assert pdf.stat().st_size > 10_000
 
 
 def test_the_datasize_report_has_its_claims(tmp_path):
     build_report(simulate(DATASIZE_GRID, World(epochs=12)), tmp_path)
-    found = json.loads((tmp_path / "datasize" / "report.json").read_text())
-    assert [claim["claim"] for claim in found["claims"]] == ["D1", "D2", "D3", "D4"]
-    assert found["figures"][0]["name"] == "datasize_convergespeed"
+    content = json.loads((tmp_path / "datasize" / "report.json").read_text())
+    assert [claim["claim"] for claim in content["claims"]] == ["D1", "D2", "D3", "D4"]
+    assert content["figures"][0]["name"] == "datasize_convergespeed"
 
 
 @pytest.fixture(scope="module")
@@ -235,10 +235,13 @@ def test_compare_draws_into_the_file_that_it_is_given(committed, tmp_path, capsy
     monkeypatch.chdir(tmp_path)
     (tmp_path / "report.json").write_bytes(summarise(committed[0]).json())
     (tmp_path / "my pictures").mkdir()
-    for file, shown in ((Path("my pictures/a.svg"), "![Dot plot"), (tmp_path / "my pictures" / "b.pdf", "\n[Dot plot")):
+    for file, picture in (
+        (Path("my pictures/a.svg"), "![Dot plot"),
+        (tmp_path / "my pictures" / "b.pdf", "\n[Dot plot"),
+    ):
         assert __main__.main(["compare", ".", ".", "--figure", str(file)]) == 0
         text = capsys.readouterr().out
-        assert shown in text
+        assert picture in text
         assert f"](my%20pictures/{file.name})" in text
     assert {path.name for path in Path("my pictures").iterdir()} == {"a.svg", "b.pdf"}
 

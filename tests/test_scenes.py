@@ -46,10 +46,10 @@ def _dense(line):
 @pytest.mark.parametrize("name", SCENES)
 def test_adapted_scenes_give_frames(drives, name):
     settings = load_profile("smoke").birdview
-    made = adapt(drives[name], name)
-    assert (made.episode.labels, made.skipped) == ("derived", 0)
-    moments = valid_moments(made.episode, settings)
-    images, masks = Renderer(made.episode, settings).render(moments[:: len(moments) // 5])
+    adapted = adapt(drives[name], name)
+    assert (adapted.episode.labels, adapted.skipped) == ("derived", 0)
+    moments = valid_moments(adapted.episode, settings)
+    images, masks = Renderer(adapted.episode, settings).render(moments[:: len(moments) // 5])
     assert images.any(axis=(1, 2, 3)).all()
     assert masks[:, 1].any(axis=1).all()
 

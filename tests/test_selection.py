@@ -139,9 +139,9 @@ def test_raking_never_takes_more_than_there_is(seed):
     """Whatever is scarce or missing, the number is met, and the margins come nearer than without raking."""
     rng = np.random.default_rng(seed)
     available = rng.integers(0, 300, (7, 3, 2)) * (rng.random((7, 3, 2)) < 0.6)
-    wanted = int(available.sum() * 0.7)
-    counts = rake(available, {0: STEERING, 1: CLASSES}, wanted, 20.0)
-    assert counts.sum() == wanted
+    total = int(available.sum() * 0.7)
+    counts = rake(available, {0: STEERING, 1: CLASSES}, total, 20.0)
+    assert counts.sum() == total
     assert ((counts >= 0) & (counts <= available)).all()
     far = {name: np.abs(margins(table, 1) - CLASSES).sum() for name, table in (("raked", counts), ("raw", available))}
     assert far["raked"] <= far["raw"] + 0.01

@@ -170,18 +170,18 @@ def test_only_missing_drives_are_recorded_and_drafts_of_the_dead_are_swept(tmp_p
     folder = tmp_path / "drives"
     first = run_flow(record_flow(TINY, SHORT, [1, 2], folder))
     stamp = (first[0] / "episode.json").stat().st_mtime_ns
-    whole = bytes_of(first[0])
+    content = bytes_of(first[0])
     draft = folder / ".00000009.abc"
     draft.mkdir()
-    seen: list[tuple[str, int, int]] = []
+    steps: list[tuple[str, int, int]] = []
 
     def progress(stage: str, done: int, total: int) -> None:
-        seen.append((stage, done, total))
+        steps.append((stage, done, total))
         (folder / ".00000003.def").mkdir(exist_ok=True)  # as a worker that is killed in this moment
 
     paths = run_flow(record_flow(TINY, SHORT, [1, 2, 3], folder), progress=progress)
-    assert seen == [("record", 2, 3), ("record", 3, 3)]
+    assert steps == [("record", 2, 3), ("record", 3, 3)]
     assert (first[0] / "episode.json").stat().st_mtime_ns == stamp
-    assert bytes_of(first[0]) == whole
+    assert bytes_of(first[0]) == content
     assert list(folder.glob(".*/")) == []
     assert read_episode(paths[2]).source["seed"] == 3

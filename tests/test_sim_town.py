@@ -41,12 +41,12 @@ def test_every_lane_leads_to_every_other(seed: int) -> None:
     town = town_of(seed)
     exits = {entry: {town.movements[way].exit for way in ways} for entry, ways in town.ways.items()}
     for start in list(exits)[::7]:
-        seen, todo = {start}, [start]
+        reached, todo = {start}, [start]
         while todo:
-            for lane in exits[todo.pop()] - seen:
-                seen.add(lane)
+            for lane in exits[todo.pop()] - reached:
+                reached.add(lane)
                 todo.append(lane)
-        assert seen == set(exits)
+        assert reached == set(exits)
 
 
 def test_streets_are_dropped_as_asked() -> None:

@@ -17,10 +17,10 @@ def test_more_heads_cost_more():
 
 
 def test_a_smaller_fraction_costs_less_unless_the_steps_are_held():
-    half, whole = Cell(heads="rec", fraction=0.5), Cell(heads="rec")
-    assert cell_cost(StudySettings(), half, 15).seconds < cell_cost(StudySettings(), whole, 15).seconds
+    half, all_data = Cell(heads="rec", fraction=0.5), Cell(heads="rec")
+    assert cell_cost(StudySettings(), half, 15).seconds < cell_cost(StudySettings(), all_data, 15).seconds
     held = changed(encoder={"budget": "steps"})
-    assert cell_cost(held, half, 15) == cell_cost(held, whole, 15)
+    assert cell_cost(held, half, 15) == cell_cost(held, all_data, 15)
 
 
 def test_disk_holds_at_least_the_images():

@@ -19,9 +19,9 @@ COUNT = 3
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    made = tmp_path_factory.mktemp("drives")
-    write_drives(made, COUNT)
-    return made
+    folder = tmp_path_factory.mktemp("drives")
+    write_drives(folder, COUNT)
+    return folder
 
 
 @pytest.fixture(scope="module")
@@ -29,8 +29,8 @@ def labels(folder):
     """Return candidate moments of all drives; the last drive is for testing."""
     settings = FramesSettings(spacing=0.3), BirdviewSettings()
     parts = [candidates(path, number, "policy", *settings) for number, path in enumerate(sorted(folder.iterdir()))]
-    made = pd.concat([pd.DataFrame(part) for part in parts], ignore_index=True)
-    return made.assign(train=made["episode"] < COUNT - 1)
+    table = pd.concat([pd.DataFrame(part) for part in parts], ignore_index=True)
+    return table.assign(train=table["episode"] < COUNT - 1)
 
 
 @pytest.fixture(scope="module")

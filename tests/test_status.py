@@ -49,15 +49,15 @@ def test_a_cell_is_what_its_attempts_say_and_its_process_does(attempts, expected
 
 
 def test_a_running_cell_tells_where_since_when_and_how_far():
-    found = state(attempt("RUNNING", tags={"progress": "encoder 26/120", "device": "CPU"}))
-    assert (found.host, found.process, found.device) == ("elsewhere", str(GONE), "CPU")
-    assert (found.stage, found.epoch, found.epochs) == ("encoder", 3, 12)
-    assert found.since == NOW - 600
+    cell_state = state(attempt("RUNNING", tags={"progress": "encoder 26/120", "device": "CPU"}))
+    assert (cell_state.host, cell_state.process, cell_state.device) == ("elsewhere", str(GONE), "CPU")
+    assert (cell_state.stage, cell_state.epoch, cell_state.epochs) == ("encoder", 3, 12)
+    assert cell_state.since == NOW - 600
 
 
 def test_of_a_traceback_the_line_that_says_something_is_shown():
-    told = "Traceback (most recent call last):\n  File ...\nValueError: no room\n"
-    assert state(attempt("FAILED", tags={"reason": told})).reason == "ValueError: no room"
+    message = "Traceback (most recent call last):\n  File ...\nValueError: no room\n"
+    assert state(attempt("FAILED", tags={"reason": message})).reason == "ValueError: no room"
     assert state(attempt("FAILED", tags={"reason": "the loss is nan\nat step 3"})).reason == "the loss is nan"
 
 

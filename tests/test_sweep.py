@@ -22,10 +22,10 @@ TWO = ("--heads", "[rec,full]")
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """Return a working folder in which `heads` has run with two head sets and the ceiling."""
-    made = working_folder(tmp_path_factory.mktemp("sweep"))
-    done = sweep(made, "heads", *SMALL, *TWO)
-    assert done.returncode == 0, done.stderr
-    return made
+    working = working_folder(tmp_path_factory.mktemp("sweep"))
+    completed = sweep(working, "heads", *SMALL, *TWO)
+    assert completed.returncode == 0, completed.stderr
+    return working
 
 
 def table(folder):
@@ -44,15 +44,15 @@ def test_a_sweep_run_holds_the_data_card(folder):
 
 def test_the_same_command_again_trains_nothing(folder):
     before = run_database(folder).cell_counts()
-    done = sweep(folder, "heads", *SMALL, *TWO, "--no-report")
-    assert done.returncode == 0
-    assert "3 of 3 cells finished" in done.stderr
+    completed = sweep(folder, "heads", *SMALL, *TWO, "--no-report")
+    assert completed.returncode == 0
+    assert "3 of 3 cells finished" in completed.stderr
     assert run_database(folder).cell_counts() == before
 
 
 def test_datasize_reuses_the_cells_of_heads(folder):
-    done = sweep(folder, "datasize", *SMALL, "--fractions", "[1.0,0.5]", "--dry-run", "--json")
-    states = Counter(cell["status"] for cell in json.loads(done.stdout)["cells"])
+    completed = sweep(folder, "datasize", *SMALL, "--fractions", "[1.0,0.5]", "--dry-run", "--json")
+    states = Counter(cell["status"] for cell in json.loads(completed.stdout)["cells"])
     assert states == {"finished": 3, "waiting": 2}
 
 
@@ -61,12 +61,12 @@ def test_a_failed_cell_leaves_the_others_is_told_and_runs_again_when_asked_for(u
     undisturbed.copy(tmp_path)
     words = (*FOUR_CELLS, "--heads", "[rec,rec+pred]", "--encoder.lr", "1e30", "--no-report")
     for more, tries in ((), 2), ((), 2), (("--retry-failed",), 4):
-        done = sweep(tmp_path, *words, *more)
-        assert done.returncode == 1
-        assert "failed: rec 100% e0" in done.stderr
-        assert "failed: rec+pred 100% e0" in done.stderr
-        assert "epoch" in done.stderr
-        assert " --retry-failed\n" in done.stderr
+        completed = sweep(tmp_path, *words, *more)
+        assert completed.returncode == 1
+        assert "failed: rec 100% e0" in completed.stderr
+        assert "failed: rec+pred 100% e0" in completed.stderr
+        assert "epoch" in completed.stderr
+        assert " --retry-failed\n" in completed.stderr
         assert run_database(tmp_path).cell_counts() == {"FAILED": tries}
 
 
@@ -74,8 +74,8 @@ def test_a_failed_cell_leaves_the_others_is_told_and_runs_again_when_asked_for(u
 @pytest.mark.parametrize("workers", ["1", "4"])
 def test_one_and_four_workers_give_the_table_of_two(undisturbed, tmp_path, workers):
     undisturbed.copy(tmp_path)
-    done = sweep(tmp_path, *FOUR_CELLS, "--workers", workers, "--no-report")
-    assert done.returncode == 0, done.stderr
+    completed = sweep(tmp_path, *FOUR_CELLS, "--workers", workers, "--no-report")
+    assert completed.returncode == 0, completed.stderr
     assert table(tmp_path).to_csv() == table(undisturbed.folder).to_csv()
 
 
@@ -87,18 +87,18 @@ def test_a_finished_cell_computed_again_has_the_same_bytes(undisturbed):
         }
 
     before = kept()
-    done = sweep(undisturbed.folder, "verify", *TINY_SWEEP, "--ceiling", "false")
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "equal: curves, weights, samples and predictions, byte for byte" in done.stdout
+    completed = sweep(undisturbed.folder, "verify", *TINY_SWEEP, "--ceiling", "false")
+    assert completed.returncode == 0, completed.stdout + completed.stderr
+    assert "equal: curves, weights, samples and predictions, byte for byte" in completed.stdout
     assert kept() == before
 
 
 def test_a_result_tells_what_made_it(folder):
     tracker = Tracker(f"sqlite:///{folder}/mlruns/mlflow.db")
-    told = next(iter(tracker.reader.read_sweep("heads").results.values())).facts
-    assert told["threads"] == 1
-    assert told["provenance"]["determinism"].keys() >= {"deterministic_algorithms", "cudnn_benchmark", "matmul_tf32"}
-    assert told["provenance"]["seeds"]["policies"] == [0, 1, 2]
+    facts = next(iter(tracker.reader.read_sweep("heads").results.values())).facts
+    assert facts["threads"] == 1
+    assert facts["provenance"]["determinism"].keys() >= {"deterministic_algorithms", "cudnn_benchmark", "matmul_tf32"}
+    assert facts["provenance"]["seeds"]["policies"] == [0, 1, 2]
 
 
 @pytest.mark.stress
@@ -107,10 +107,10 @@ def test_encoders_that_differ_by_their_seed_alone_show_no_effect(folder, tmp_pat
     for name in ("sweeps", "data/episodes", "data/frames"):
         shutil.copytree(folder / name, tmp_path / name)
     words = ("heads", *SMOKE, "--heads", "[rec]", "--encoder_seeds", "4", "--ceiling", "false", "--no-report")
-    done = sweep(tmp_path, *words, "--workers", "2")
-    assert done.returncode == 0, done.stderr
+    completed = sweep(tmp_path, *words, "--workers", "2")
+    assert completed.returncode == 0, completed.stderr
     words = [sys.executable, ROOT / "benchmarks/null_study.py", "heads", "--profile", "smoke"]
-    told = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=True).stdout
-    outcomes = set(re.findall(r"^(H\d) ([a-z ]+): \d+$", told, re.MULTILINE))
+    output = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+    outcomes = set(re.findall(r"^(H\d) ([a-z ]+): \d+$", output, re.MULTILINE))
     assert {claim for claim, _ in outcomes} == {"H1", "H2", "H3", "H4", "H5"}
     assert {claim for claim, outcome in outcomes if outcome == "reproduced"} <= {"H1"}  # which says: no effect

@@ -120,10 +120,10 @@ def assert_same_result(left, right):
     assert (left.cell, left.key, left.settings, left.facts) == (right.cell, right.key, right.settings, right.facts)
     pd.testing.assert_frame_equal(left.curves, right.curves)
     for part in ARRAYS:
-        mine, theirs = getattr(left, part), getattr(right, part)
-        assert mine.keys() == theirs.keys()
-        for name in mine:
-            np.testing.assert_array_equal(mine[name], theirs[name])
+        ours, theirs = getattr(left, part), getattr(right, part)
+        assert ours.keys() == theirs.keys()
+        for name in ours:
+            np.testing.assert_array_equal(ours[name], theirs[name])
 
 
 # --- a cell ---------------------------------------------------------------------------------------------------------
@@ -153,11 +153,11 @@ def test_live_points_appear_while_training_and_are_there_once_at_the_end(tracker
     for value, epoch in zip(loss["value"], loss["epoch"], strict=True):
         run.log("encoder", epoch, {"test/loss": value})
         run.log("encoder", epoch, {"test/loss": value + 1e-9})  # a resumed worker says it again, nearly the same
-    wanted = set(zip(loss["epoch"], loss["value"], strict=True))
+    expected = set(zip(loss["epoch"], loss["value"], strict=True))
     run.flush_live()
-    assert curve(tracker, run.run_id, "encoder/test/loss") == wanted
+    assert curve(tracker, run.run_id, "encoder/test/loss") == expected
     tracker.commit(run, result)
-    assert curve(tracker, run.run_id, "encoder/test/loss") == wanted
+    assert curve(tracker, run.run_id, "encoder/test/loss") == expected
     assert_no_point_twice(tracker, run.run_id)
 
 
@@ -209,8 +209,8 @@ def test_the_final_score_is_the_mean_of_the_last_five_test_epochs(tracker):
     run_id = train(tracker, open_sweep(tracker, planned), planned, "final-0")
     curves = make_result(planned["final-0"], "final-0").curves
     late = curves[(curves["split"] == "test") & (curves["epoch"] > EPOCHS - 5)]
-    wanted = late[late["metric"] == "acceleration_accuracy"]["value"].mean()
-    assert tracker.client.get_run(run_id).data.metrics["final/acceleration_accuracy"] == pytest.approx(wanted)
+    expected = late[late["metric"] == "acceleration_accuracy"]["value"].mean()
+    assert tracker.client.get_run(run_id).data.metrics["final/acceleration_accuracy"] == pytest.approx(expected)
 
 
 def test_a_list_of_runs_reads_well(tracker):
@@ -237,8 +237,8 @@ def test_the_view_of_all_cells_shows_columns_that_there_are(tracker):
     planned = cells("view")
     run = tracker.client.get_run(train(tracker, open_sweep(tracker, planned), planned, "view-0"))
     view = json.loads(tracker.client.get_experiment(tracker.experiment.id).tags["mlflow.sharedViewState.cells"])
-    there = {f"{kind}.`{name}`" for kind in ("params", "metrics", "tags") for name in getattr(run.data, kind)}
-    assert set(view["selectedColumns"]) <= there
+    columns = {f"{kind}.`{name}`" for kind in ("params", "metrics", "tags") for name in getattr(run.data, kind)}
+    assert set(view["selectedColumns"]) <= columns
     assert [found.info.run_id for found in tracker.experiment.search(view["searchFilter"])] == [run.info.run_id]
 
 
@@ -613,8 +613,8 @@ def test_credentials_are_hidden():
 
 def test_a_normal_use_prints_nothing(uri):
     code = f"from study.tracking.tracker import Tracker; print(Tracker({uri!r}).reader.finished(['x']), end='')"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert (done.stdout, done.stderr) == ("{}", "")
+    completed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert (completed.stdout, completed.stderr) == ("{}", "")
 
 
 # --- a server -------------------------------------------------------------------------------------------------------

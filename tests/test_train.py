@@ -67,12 +67,12 @@ def home(tmp_path_factory):
 def test_the_limit_ends_a_piece_and_says_that_cells_are_left(home, tmp_path):
     began = time.monotonic()
     words = [*PLAN, "--encoder.epochs", "1000000", "--out", str(tmp_path), "--limit-seconds", "8"]
-    done = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, "-m", "study.sweep", "train", *words], capture_output=True, text=True, check=False
     )
-    assert done.returncode == EXIT_AGAIN, done.stderr
+    assert completed.returncode == EXIT_AGAIN, completed.stderr
     assert 8 <= time.monotonic() - began < 90
-    assert "Traceback" not in done.stderr
+    assert "Traceback" not in completed.stderr
     assert not list(tmp_path.glob("*/cell.json"))
 
 
@@ -88,9 +88,9 @@ def test_a_cell_that_another_process_trains_is_left_to_it(home, tmp_path, capsys
 
 def test_a_cell_that_fails_is_told_and_the_others_go_on(home, tmp_path, capsys):
     assert main([*PLAN, "--encoder.lr", "1e30", "--out", str(tmp_path)]) == EXIT_FAILED
-    said = capsys.readouterr().err
-    assert "failed: rec 100% e0" in said
-    assert "failed: full 100% e0" in said
+    message = capsys.readouterr().err
+    assert "failed: rec 100% e0" in message
+    assert "failed: full 100% e0" in message
 
 
 def test_drives_that_are_missing_without_a_simulator_are_told(home, tmp_path, monkeypatch):
@@ -106,15 +106,15 @@ def test_a_library_that_is_missing_is_told_before_the_data_is_made(home, tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (["--limit-seconds", "0"], "above 0"),
         (["--device", "cuda:99"], "choose from cpu"),
         (["--out", "/dev/null/results"], "cannot write"),
     ],
 )
-def test_what_cannot_be_used_is_told(home, tmp_path, words, said):
-    with pytest.raises(BadInputError, match=said):
+def test_what_cannot_be_used_is_told(home, tmp_path, words, message):
+    with pytest.raises(BadInputError, match=message):
         main([*PLAN, "--out", str(tmp_path), *words])
 
 
@@ -123,7 +123,7 @@ def test_what_cannot_be_used_is_told(home, tmp_path, words, said):
 
 def script(code, *words, cwd=None, **environment):
     """Run a step of benchmarks/paper_scale.sh, of the code in a folder, and return what it says."""
-    done = subprocess.run(
+    completed = subprocess.run(
         ["bash", str(code / "benchmarks" / "paper_scale.sh"), *words],
         cwd=cwd,
         env=os.environ | {"PYTHON": sys.executable, **environment},
@@ -131,8 +131,8 @@ def script(code, *words, cwd=None, **environment):
         text=True,
         check=False,
     )
-    assert done.returncode == 0, done.stderr
-    return done.stderr
+    assert completed.returncode == 0, completed.stderr
+    return completed.stderr
 
 
 @pytest.fixture(scope="module")

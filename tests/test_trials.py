@@ -84,8 +84,8 @@ os.kill(os.getpid(), signal.SIGKILL)
 
 
 def test_what_a_killed_process_left_is_closed_by_the_next(file):
-    done = subprocess.run([sys.executable, "-c", KILLED, file, STUDY], check=False)
-    assert done.returncode == -signal.SIGKILL
+    completed = subprocess.run([sys.executable, "-c", KILLED, file, STUDY], check=False)
+    assert completed.returncode == -signal.SIGKILL
     assert states(file) == {"RUNNING": 1, "WAITING": 2}
     trials = start(file, ["k3", "k1"])
     assert states(file) == {"FAIL": 1, "PRUNED": 2, "WAITING": 2}

@@ -37,16 +37,19 @@ def test_one_bit_is_a_difference():
     changed = weights.copy()
     changed.flat[0] = np.nextafter(changed.flat[0], np.float32(9))
     again.encoder[name] = changed
-    (found,) = differences(RESULT, again)
-    assert (found.name, found.values) == (f"encoder: {name}", 1)
-    assert 0 < found.largest < 1e-5
+    (difference,) = differences(RESULT, again)
+    assert (difference.name, difference.values) == (f"encoder: {name}", 1)
+    assert 0 < difference.largest < 1e-5
 
 
 def test_what_is_missing_or_of_another_shape_is_a_difference():
     again = copy()
     again.predictions["steering"] = again.predictions["steering"][:-1]
     del again.predictions["episode"]
-    assert {found.name for found in differences(RESULT, again)} == {"predictions: steering", "predictions: episode"}
+    assert {difference.name for difference in differences(RESULT, again)} == {
+        "predictions: steering",
+        "predictions: episode",
+    }
 
 
 def test_conditions_that_were_not_recorded_are_no_change():
@@ -56,9 +59,9 @@ def test_conditions_that_were_not_recorded_are_no_change():
 
 def test_changed_conditions_are_named():
     now = TOLD | {"threads": 7, "provenance": ORIGIN | {"cpu": "B", "diff": "+A", "packages": {"torch": "3"}}}
-    told = "; ".join(changes(TOLD, now))
+    text = "; ".join(changes(TOLD, now))
     for words in ("threads: 2 then, 7 now", "cpu: A then, B now", "torch: 2.13.0 then, 3 now", "uncommitted changes"):
-        assert words in told
+        assert words in text
 
 
 def test_another_result_under_the_same_conditions_is_an_error(capsys):

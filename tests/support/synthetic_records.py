@@ -273,13 +273,13 @@ def simulate(grid=HEADS_GRID, world=None, seed=0, settings=None, unfinished=(), 
         key: simulate_cell(cell, key, settings, world, grid.policy_seeds, rng, labels) for key, cell in planned.items()
     }
     broken = {key: "TrainingDivergedError: loss is nan" for key, cell in planned.items() if cell.label in failed}
-    gone = {key for key, cell in planned.items() if cell.label in (*unfinished, *failed)}
+    missing = {key for key, cell in planned.items() if cell.label in (*unfinished, *failed)}
     return SweepRecord(
         grid=grid,
         profile="laptop",
         settings=settings,
         planned=planned,
-        results={key: result for key, result in results.items() if key not in gone},
+        results={key: result for key, result in results.items() if key not in missing},
         failed=broken,
         provenance={
             "commit": "0123456789abcdef0123456789abcdef01234567",
@@ -315,7 +315,7 @@ def manifest():
 
     def one(train, test, classes, near_zero):
         parts = {name: labels(n, 80, classes, round(near_zero * n)) for name, n in (("train", train), ("test", test))}
-        whole = labels(train + test, 80, classes, round(near_zero * (train + test)))
+        all_labels = labels(train + test, 80, classes, round(near_zero * (train + test)))
         candidates = labels(180_000, 80, (0.5, 0.1, 0.4), 120_000)
         return {
             "frames": train + test,
@@ -323,7 +323,7 @@ def manifest():
             "test": test,
             "test_drives": 16,
             "candidates": candidates,
-            "chosen": {"all": whole, **parts},
+            "chosen": {"all": all_labels, **parts},
         }
 
     return {
