@@ -284,16 +284,6 @@ def test_a_committed_cell_has_its_model_with_its_scores(tracker, network):
         assert network_at(tracker, address).read_bytes() == network
 
 
-def test_a_commit_that_broke_off_is_repeated_with_one_model(tracker, network):
-    planned = cells("once")
-    run = start(tracker, open_sweep(tracker, planned), planned, "once-0")
-    for _ in range(2):
-        tracker.commit(run, make_result(planned["once-0"], "once-0"), network)
-        tracker.client.update_run(run.run_id, status="RUNNING")  # as if it had been cut before the last step
-    assert len(models(tracker)) == 1
-    assert len(tracker.client.get_run(run.run_id).outputs.model_outputs) == 1
-
-
 def test_an_attempt_that_was_killed_leaves_no_model(tracker):
     planned = cells("pending")
     sweep = open_sweep(tracker, planned)
@@ -332,15 +322,17 @@ def test_of_two_attempts_that_finish_the_first_counts(tracker):
     assert status(tracker, second.run_id) == "KILLED"
 
 
-def test_a_commit_that_broke_off_is_repeated_without_doubling(tracker):
+def test_a_commit_that_broke_off_is_repeated_without_doubling(tracker, network):
     planned = cells("twice")
     run = start(tracker, open_sweep(tracker, planned), planned, "twice-0")
     result = make_result(planned["twice-0"], "twice-0")
     run.log("encoder", 1, {"train/loss": 0.5})
-    tracker.commit(run, result)
+    tracker.commit(run, result, network)
     tracker.client.update_run(run.run_id, status="RUNNING")  # as if it had been cut before the last step
-    assert tracker.commit(run, result) == run.run_id
+    assert tracker.commit(run, result, network) == run.run_id
     assert len(children(tracker, run.run_id)) == SEEDS
+    assert len(models(tracker)) == 1
+    assert len(tracker.client.get_run(run.run_id).outputs.model_outputs) == 1
     for each in (run.run_id, *(seed.info.run_id for seed in children(tracker, run.run_id))):
         assert_no_point_twice(tracker, each)
 
