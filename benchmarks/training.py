@@ -41,7 +41,7 @@ from study.compute.provenance import cores, provenance
 from study.config.heads import HEAD_SETS, HEADS
 from study.config.paper import CHANNELS, CORE, IMAGE, KERNEL, LATENT
 from study.config.settings import EncoderSettings, FramesSettings, PolicySettings
-from study.data.frames import SHAPES, Frames
+from study.data.frames import Frames, shapes
 from study.encoder import checkpoint, training
 from study.encoder.autoencoder import MultiHeadAutoencoder
 from study.encoder.batches import plan_training
@@ -167,7 +167,7 @@ def random_frames(train: int, test: int, folder: Path | None = None) -> Frames:
     """Frames of any content; mapped from files of zeros when there is a folder."""
     rng = np.random.default_rng(0)
     arrays = {}
-    for name, shape in SHAPES.items():
+    for name, shape in shapes(2).items():
         whole = (train + test, *shape)
         if folder is None:
             arrays[name] = rng.integers(0, 256, whole, np.uint8)

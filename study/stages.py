@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from typing import Any, TypeAlias, TypeVar
 
 from study.config.grid import Cell
-from study.config.heads import CEILING, HEAD_SETS
+from study.config.heads import CEILING, HEAD_SETS, mask_heads
 from study.config.keys import cell_key, encoder_key, frames_key, recording_key
 from study.config.paper import IMAGE
 from study.config.settings import StudySettings
@@ -34,7 +34,6 @@ POLICY_FRAME_S = 1 / 500_000  # a frame forward and backward through one policy,
 DRIVE_READ_S = 0.12  # a drive read again for the true state
 RESULT_S = 5.0  # a result is put together, exported and committed
 
-FRAME_BYTES = IMAGE * IMAGE * 3 + 2 * IMAGE * IMAGE // 8 + 40  # image, two bit masks, labels
 STATE_BYTES = 32  # of one vehicle at one step in an Episode
 RESULT_BYTES = 12_000_000  # weights, curves, samples and predictions of a cell, with its share of the tracking store
 
@@ -186,7 +185,8 @@ def recording_cost(settings: StudySettings) -> Cost:
 def data_cost(settings: StudySettings, *, recorded: bool = True) -> Cost:
     """Return the cost of rendering the frames and, unless the drives exist already, of recording them."""
     images = settings.frames.encoder + settings.frames.policy
-    rendering = Cost(RENDER.cost(Work(settings)), images * FRAME_BYTES)
+    frame_bytes = IMAGE * IMAGE * 3 + len(mask_heads()) * IMAGE * IMAGE // 8 + 40  # image, bit masks, labels
+    rendering = Cost(RENDER.cost(Work(settings)), images * frame_bytes)
     return total([recording_cost(settings), rendering]) if recorded else rendering
 
 

@@ -29,7 +29,7 @@ from study.data.frames import Frames, open_frames, unpack_masks
 from study.encoder import batches, networks, training
 from study.encoder.autoencoder import MultiHeadAutoencoder
 from study.encoder.batches import plan_training
-from study.encoder.inputs import unpack
+from study.encoder.inputs import mask_places, unpack
 from study.encoder.latents import choose_samples, encode
 from study.encoder.networks import Decoder, Encoder
 from study.encoder.training import TrainedEncoder, train_encoder
@@ -197,7 +197,7 @@ def test_initial_weights_are_spread_as_torchs_own() -> None:
 def test_masks_are_unpacked_as_the_frame_store_packs_them(frames: Frames) -> None:
     masks = np.array(frames.masks[:20])
     assert masks.any()
-    unpacked = unpack(torch.from_numpy(masks), ["pred", "plan"])
+    unpacked = unpack(torch.from_numpy(masks), mask_places(["pred", "plan"]))
     expected = unpack_masks(masks)
     assert np.array_equal(unpacked["pred"].squeeze(1).numpy(), expected[:, 0])
     assert np.array_equal(unpacked["plan"].squeeze(1).numpy(), expected[:, 1])
@@ -230,7 +230,7 @@ def test_gradients_taken_head_by_head_are_those_of_the_total_loss(frames: Frames
     losses = dict(zip(module.metrics, module.gradients(images, masks, module._noise(16)).tolist(), strict=True))
 
     reference = MultiHeadAutoencoder("full", settings, 0)
-    pixels, targets = images.permute(0, 3, 1, 2) / 255, unpack(masks, ["pred", "plan"])
+    pixels, targets = images.permute(0, 3, 1, 2) / 255, unpack(masks, mask_places(["pred", "plan"]))
     features = reference.encoder.features(pixels)
     mean, log_variance = reference.encoder.mean(features), reference.encoder.log_variance(features)
     noise = networks.seeded_generator(0, "noise")

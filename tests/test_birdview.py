@@ -9,11 +9,11 @@ import pytest
 from study.config.keys import FORMAT_VERSIONS
 from study.config.settings import BirdviewSettings
 from study.data import birdview
-from study.data.birdview import Renderer, governing_light, render_birdview, valid_moments
+from study.data.birdview import Renderer, governing_light, valid_moments
 from study.episode.checks import check_episode
 from study.episode.schema import GREEN, RED, YELLOW, Agent, Episode, Lane, Light, empty_states
 from study.errors import BadInputError
-from tests.support.drives import crossing_drive
+from tests.support.drives import bird_view, crossing_drive
 
 SETTINGS = BirdviewSettings()
 NOW = 10  # a step with a whole history and future
@@ -94,7 +94,7 @@ def average(picture):
 def test_another_car_is_yellow_where_the_ego_sees_it(heading, ahead, left):
     """Whatever way the ego heads, ahead is up and left is left."""
     x, y = from_ego(heading, ahead, left)
-    image, _, _ = render_birdview(drive([(5, -3, heading, 0.0), (x, y, heading, 0.0)]), NOW, 0, SETTINGS)
+    image, _, _ = bird_view(drive([(5, -3, heading, 0.0), (x, y, heading, 0.0)]), NOW, 0, SETTINGS)
     assert tuple(image[pixel(ahead, left)]) == (255, 255, 0)
     assert tuple(image[pixel(0, 0)]) == (0, 0, 255)
     image[
@@ -113,7 +113,7 @@ def test_a_left_turn_looks_like_a_left_turn():
         turned[:-10] = episode.heading[10:] - episode.heading[:-10]
         for step, agent in valid_moments(episode, SETTINGS):
             if abs(turned[step, agent]) > 0.5:
-                _, _, plan = render_birdview(episode, step, agent, SETTINGS)
+                _, _, plan = bird_view(episode, step, agent, SETTINGS)
                 far = np.flatnonzero(plan.any(axis=1))[0]
                 side = np.flatnonzero(plan[far]).mean() - 31.5
                 assert np.sign(side) == -np.sign(turned[step, agent])
@@ -127,7 +127,7 @@ def test_past_poses_fade_linearly_to_black(who, colour):
     """Poses that do not touch show each pose's light: full now, less by one step for each tenth of a second."""
     pace = 1.25  # two pixels per step
     tracks = [(0, 0, 0.0, pace), (0, 8, 0.0, pace)]
-    image, _, _ = render_birdview(drive(tracks, sizes=(1.25, 2.0)), NOW, 0, SETTINGS)
+    image, _, _ = bird_view(drive(tracks, sizes=(1.25, 2.0)), NOW, 0, SETTINGS)
     column = pixel(0, 8 * who)[1]
     light = [image[pixel(-pace * age, 0)[0], column] for age in range(11)]
     expected = np.outer(255 * (11 - np.arange(11)) / 11, colour)
@@ -136,7 +136,7 @@ def test_past_poses_fade_linearly_to_black(who, colour):
 
 def test_the_present_pose_lies_on_top_of_older_ones():
     """A car that backs up covers where it was a moment ago with its full colour."""
-    image, _, _ = render_birdview(drive([(0, 0, 0.0, 0.0), (10, 0, 0.0, -0.2)]), NOW, 0, SETTINGS)
+    image, _, _ = bird_view(drive([(0, 0, 0.0, 0.0), (10, 0, 0.0, -0.2)]), NOW, 0, SETTINGS)
     assert tuple(image[pixel(10, 0)]) == (255, 255, 0)
     assert 0 < image[pixel(13.0, 0)][0] < 255
 
@@ -156,7 +156,7 @@ def test_the_route_has_the_colour_of_the_light_that_governs_it(light, colour):
     """Red for yellow and red within range, else green; only ahead of the ego."""
     heading = 0.4
     episode = drive([(5, -3, heading, 0.0)], routes=[straight_route(heading)], light=light)
-    image, _, _ = render_birdview(episode, NOW, 0, SETTINGS)
+    image, _, _ = bird_view(episode, NOW, 0, SETTINGS)
     assert tuple(image[pixel(15, 0)]) == colour
     assert tuple(image[pixel(24, 0)]) == colour
     assert tuple(image[pixel(15, 3)]) == (0, 0, 0)
@@ -168,13 +168,13 @@ def test_no_route_is_drawn_where_none_is_known():
     unknown = drive([(5, -3, 0.0, 0.0)], routes=[route])
     unknown.route_s[:] = np.nan
     for episode in (drive([(5, -3, 0.0, 0.0)]), unknown):
-        image, _, _ = render_birdview(episode, NOW, 0, SETTINGS)
+        image, _, _ = bird_view(episode, NOW, 0, SETTINGS)
         assert not image[..., :2].any()
 
 
 def test_the_route_lies_under_the_cars():
     episode = drive([(5, -3, 0.0, 0.0), (17, -3, 0.0, 0.0)], routes=[straight_route(0.0), np.empty((0, 2), np.float32)])
-    image, _, _ = render_birdview(episode, NOW, 0, SETTINGS)
+    image, _, _ = bird_view(episode, NOW, 0, SETTINGS)
     assert tuple(image[pixel(12, 0)]) == (255, 255, 0)
     assert tuple(image[pixel(6, 0)]) == (0, 255, 0)
 
@@ -183,7 +183,7 @@ def test_masks_are_the_boxes_at_the_next_ten_poses():
     """Against boxes tested pixel by pixel; only pixels about half covered may fall the other way."""
     episode = crossing_drive(4)
     for step, agent in valid_moments(episode, SETTINGS)[::97]:
-        _, pred, plan = render_birdview(episode, step, agent, SETTINGS)
+        _, pred, plan = bird_view(episode, step, agent, SETTINGS)
         others = [other for other in range(len(episode.agents)) if other != agent]
         for mask, who in ((pred, others), (plan, [agent])):
             share = average(covered(episode, step, agent, range(step + 1, step + 11), who))
@@ -203,7 +203,7 @@ def test_cars_are_painted_oldest_first_and_the_ego_last():
             for age in range(10, -1, -1):
                 there = covered(episode, step, agent, [step - age], who)
                 expected[there] = np.multiply(colour, 255 * (11 - age) / 11)
-        image, _, _ = render_birdview(episode, step, agent, SETTINGS)
+        image, _, _ = bird_view(episode, step, agent, SETTINGS)
         difference = np.abs(image - average(expected))
         assert difference.mean() < 0.5
         assert (difference > 64).mean() < 1e-3
@@ -211,8 +211,8 @@ def test_cars_are_painted_oldest_first_and_the_ego_last():
 
 def test_neither_mask_holds_the_others_cars():
     """The ego is not in pred, the others are not in plan."""
-    alone = render_birdview(drive([(0, 0, 0.0, 1.0)]), NOW, 0, SETTINGS)
-    two = render_birdview(drive([(0, 0, 0.0, 1.0), (10, 5, 0.0, 1.0)]), NOW, 0, SETTINGS)
+    alone = bird_view(drive([(0, 0, 0.0, 1.0)]), NOW, 0, SETTINGS)
+    two = bird_view(drive([(0, 0, 0.0, 1.0), (10, 5, 0.0, 1.0)]), NOW, 0, SETTINGS)
     assert not alone[1].any()
     assert two[1].any()
     np.testing.assert_array_equal(alone[2], two[2])
@@ -221,7 +221,7 @@ def test_neither_mask_holds_the_others_cars():
 def test_a_car_that_leaves_is_painted_as_long_as_it_was_there():
     episode = drive([(0, 0, 0.0, 0.0), (10, 5, 0.0, 0.0)])
     episode.present[NOW:, 1] = False
-    image, pred, _ = render_birdview(episode, NOW, 0, SETTINGS)
+    image, pred, _ = bird_view(episode, NOW, 0, SETTINGS)
     assert not pred.any()
     assert tuple(image[pixel(10, 5)]) == (232, 232, 0)  # its pose of a tenth of a second ago
 
@@ -231,8 +231,8 @@ def test_moments_at_the_edge_of_a_drive_show_what_is_recorded():
     episode = drive([(0, 0, 0.0, 0.5), (10, 5, 0.0, 0.5)])
     arrays = [item.name for item in dataclasses.fields(episode) if isinstance(getattr(episode, item.name), np.ndarray)]
     cut = dataclasses.replace(episode, **{name: getattr(episode, name)[: NOW + 1] for name in arrays})
-    image, pred, plan = render_birdview(cut, NOW, 0, SETTINGS)
-    np.testing.assert_array_equal(image, render_birdview(episode, NOW, 0, SETTINGS)[0])
+    image, pred, plan = bird_view(cut, NOW, 0, SETTINGS)
+    np.testing.assert_array_equal(image, bird_view(episode, NOW, 0, SETTINGS)[0])
     assert not pred.any()
     assert not plan.any()
 
@@ -253,7 +253,7 @@ def test_the_map_cut_from_one_picture_is_the_map_painted_in_place(monkeypatch):
 def test_road_and_borders_lie_where_the_map_says():
     """A road along x, ego heading east: surface beside it, curb on its right, line on its left, nothing beyond."""
     road = Lane(1, np.array([[-60.0, 0.0], [60.0, 0.0]]), 8.0, left="solid", right="curb")
-    image, _, _ = render_birdview(drive([(0, 0, 0.0, 0.0)], lanes=(road,)), NOW, 0, SETTINGS)
+    image, _, _ = bird_view(drive([(0, 0, 0.0, 0.0)], lanes=(road,)), NOW, 0, SETTINGS)
     row = image[10].astype(int)
     assert len(np.unique(image[10] - image[10, :, :1])) == 1  # grey
     surface, left, right = row[32, 0], row[pixel(0, 4)[1] - 1 : pixel(0, 4)[1] + 2, 0], row[37:40, 0]
@@ -267,7 +267,7 @@ def test_road_and_borders_lie_where_the_map_says():
 def test_a_dashed_line_has_gaps_and_a_border_of_none_is_not_drawn():
     def edge(border):
         road = Lane(1, np.array([[-60.0, 0.0], [60.0, 0.0]]), 8.0, left=border)
-        image, _, _ = render_birdview(drive([(0, 0, 0.0, 0.0)], lanes=(road,)), NOW, 0, SETTINGS)
+        image, _, _ = bird_view(drive([(0, 0, 0.0, 0.0)], lanes=(road,)), NOW, 0, SETTINGS)
         return image[:, 24:27, 0].astype(int).max(axis=1) > 100
 
     assert edge("solid").all()
@@ -281,7 +281,7 @@ def test_speed_limits_show_in_the_surface_only_where_they_differ():
             Lane(number, np.array([[-60.0, 6.0 * number], [60.0, 6.0 * number]]), 5.0, speed_limit=limit)
             for number, limit in enumerate(limits)
         )
-        image, _, _ = render_birdview(drive([(0, 3, 0.0, 0.0)], lanes=lanes), NOW, 0, SETTINGS)
+        image, _, _ = bird_view(drive([(0, 3, 0.0, 0.0)], lanes=lanes), NOW, 0, SETTINGS)
         return [int(image[(5, pixel(0, 6 * number - 3)[1], 0)]) for number in range(len(limits))]
 
     slow, fast = greys([25 / 3.6, 50 / 3.6])
@@ -307,7 +307,7 @@ def test_frames_do_not_depend_on_their_company():
     shuffled = Renderer(episode, SETTINGS).render(moments[order])
     np.testing.assert_array_equal(images[order], shuffled[0])
     np.testing.assert_array_equal(masks[order], shuffled[1])
-    image, pred, plan = render_birdview(episode, *moments[99], SETTINGS)
+    image, pred, plan = bird_view(episode, *moments[99], SETTINGS)
     np.testing.assert_array_equal(image, images[99])
     np.testing.assert_array_equal(np.packbits([pred, plan], axis=None), masks[99].ravel())
 
@@ -350,7 +350,7 @@ def test_a_moment_without_its_agent_is_refused(moment):
     episode = drive([(0, 0, 0.0, 0.0)])
     episode.present[5, 0] = False
     with pytest.raises(BadInputError, match="no agent with index"):
-        render_birdview(episode, *moment, SETTINGS)
+        bird_view(episode, *moment, SETTINGS)
 
 
 def test_a_history_with_more_shades_than_colours_is_refused():

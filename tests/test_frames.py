@@ -14,7 +14,6 @@ import pytest
 
 from study.config.keys import FORMAT_VERSIONS
 from study.config.settings import BirdviewSettings, FramesSettings
-from study.data.birdview import render_birdview
 from study.data.build import frames_flow
 from study.data.frames import epoch_order, open_frames, unpack_masks
 from study.data.selection import LABELS
@@ -22,7 +21,7 @@ from study.engine.flows import run_flow
 from study.engine.local import local_engine
 from study.episode.files import episode_digest, read_episode
 from study.errors import BadInputError
-from tests.support.drives import write_drives
+from tests.support.drives import bird_view, write_drives
 
 FRAMES = FramesSettings(encoder=120, policy=60, spacing=0.5)
 VIEW = BirdviewSettings()
@@ -56,7 +55,7 @@ def test_frames_are_the_rendered_moments_of_their_labels(built, drives):
             label = frames.labels.iloc[row]
             episode = read_episode(paths[label["episode"]])
             agent = [agent.id for agent in episode.agents].index(label["agent"])
-            image, pred, plan = render_birdview(episode, label["step"], agent, VIEW)
+            image, pred, plan = bird_view(episode, label["step"], agent, VIEW)
             np.testing.assert_array_equal(frames.images[row], image)
             np.testing.assert_array_equal(unpack_masks(frames.masks[row : row + 1])[0], [pred, plan])
 

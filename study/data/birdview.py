@@ -18,8 +18,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from study.config.heads import mask_heads
 from study.config.paper import IMAGE
 from study.config.settings import BirdviewSettings
+from study.data.targets import FRACTION_BITS, Floats, Moment, find_target, fixed_point
 from study.episode.schema import GREEN, RATE_HZ, Episode, Lane
 from study.errors import BadInputError
 
@@ -41,21 +43,10 @@ CHUNK = 64  # moments whose geometry is computed together
 _PLAIN, _BOUNDARY, _LINE = 1 + LIMIT_SHADES, 2 + LIMIT_SHADES, 3 + LIMIT_SHADES  # palette; 0 is beside the road
 _GREEN, _RED, _OTHERS = 4 + LIMIT_SHADES, 5 + LIMIT_SHADES, 6 + LIMIT_SHADES  # others' oldest pose, then younger ones
 _MASK = 240  # of a set pixel: averages of sixteen such are whole numbers
-_SHIFT = 8  # fractional bits of the coordinates given to cv2
 
 Image = NDArray[np.uint8]
 Moments = NDArray[np.int64]
-Floats = NDArray[np.float64]
 _Shape = tuple[Floats, int, float]  # points [P, 2] m, palette index, width of a line [m]; no width: a filled polygon
-
-
-def render_birdview(
-    episode: Episode, step: int, agent_index: int, settings: BirdviewSettings
-) -> tuple[Image, NDArray[np.bool_], NDArray[np.bool_]]:
-    """One moment as (image [64, 64, 3] uint8 RGB, pred [64, 64] bool, plan [64, 64] bool), see `Renderer.render`."""
-    images, masks = Renderer(episode, settings).render(np.array([[step, agent_index]]))
-    pred, plan = np.unpackbits(masks[0], axis=1).reshape(2, IMAGE, IMAGE).astype(bool)
-    return images[0], pred, plan
 
 
 def check_rate(episode: Episode) -> None:
@@ -111,13 +102,15 @@ class _Window:
 
 
 class Renderer:
-    """Paints moments of one Episode; holds the Episode's painted map.
+    """Paints moments of one Episode, with the masks of `targets`, by default those of all heads.
 
-    Raises BadInputError when the Episode is not at 10 Hz.
+    Raises BadInputError when the Episode is not at 10 Hz, or a target cannot be found.
     """
 
-    def __init__(self, episode: Episode, settings: BirdviewSettings) -> None:
+    def __init__(self, episode: Episode, settings: BirdviewSettings, targets: Sequence[str] | None = None) -> None:
         check_rate(episode)
+        names = [head.target for head in mask_heads().values()] if targets is None else targets
+        self._targets = [find_target(name) for name in names]
         self.episode = episode
         self.settings = settings
         self._palette = _palette(settings.history)
@@ -135,17 +128,16 @@ class Renderer:
         self._route_ahead = np.arange(0, 1.5 * corner, ROUTE_POINTS)
 
     def render(self, moments: NDArray[np.integer[Any]]) -> tuple[Image, Image]:
-        """Paint moments [M, 2] of (step, agent index): images [M, 64, 64, 3] uint8 RGB, masks [M, 2, 512] uint8.
+        """Paint moments [M, 2] of (step, agent index): images [M, 64, 64, 3] uint8 RGB, masks [M, K, 512] uint8.
 
-        The masks are pred (the other vehicles) and plan (the ego): the union of oriented boxes at the next
-        `settings.future` poses in the present ego frame, set where at least half of a pixel is covered, 4096 bits in
-        row-major order packed by `np.packbits`. Poses outside the recorded steps are not painted.
+        A mask of a target is set where its polygons cover at least half of a pixel: 4096 bits in row-major order,
+        packed by `np.packbits`. Poses outside the recorded steps are not painted.
         Raises BadInputError when a moment's agent is not there.
         """
         moments = np.asarray(moments, np.int64).reshape(-1, 2)
         self._check(moments)
         images = np.empty((len(moments), IMAGE, IMAGE, 3), np.uint8)
-        masks = np.empty((len(moments), 2, MASK_BYTES), np.uint8)
+        masks = np.empty((len(moments), len(self._targets), MASK_BYTES), np.uint8)
         threads = cv2.getNumThreads()
         cv2.setNumThreads(1)  # frames are too small to share; processes are what we spread them over
         try:
@@ -174,23 +166,27 @@ class Renderer:
         boxes, colours, ends = self._boxes(moments, affines, heading)
         states = governing_light(episode, self.settings, moments).tolist()
         canvas, flat = np.empty((size, size), np.uint8), np.empty((size, size), np.uint8)
-        grey = np.zeros((len(moments), 2, IMAGE, IMAGE), np.uint8)
+        grey = np.zeros((*masks.shape[:2], IMAGE, IMAGE), np.uint8)
         start = 0
         for index, (seen, pred, plan) in enumerate(ends):
             self._map.paint(canvas, affines[index], cuts[index])
             self._paint_route(canvas, affines[index], moments[index], states[index])
             for box, colour in zip(boxes[start:seen], colours[start:seen], strict=True):
-                cv2.fillConvexPoly(canvas, box, colour, cv2.LINE_8, _SHIFT)
+                cv2.fillConvexPoly(canvas, box, colour, cv2.LINE_8, FRACTION_BITS)
             channels = [_shrink(cv2.LUT(canvas, channel, dst=flat)) for channel in self._palette]
             cv2.merge(channels, dst=images[index])
-            for mask, covering in enumerate((boxes[seen:pred], boxes[pred:plan])):
-                if covering:
+            step, agent = moments[index].tolist()
+            boxes_ahead = boxes[seen:pred], boxes[pred:plan]
+            moment = Moment(episode, step, agent, self.settings, affines[index], *boxes_ahead)
+            for mask, target in enumerate(self._targets):
+                polygons = target(moment)
+                if polygons:
                     flat.fill(0)
-                    for box in covering:
-                        cv2.fillConvexPoly(flat, box, _MASK, cv2.LINE_8, _SHIFT)
+                    for polygon in polygons:
+                        cv2.fillConvexPoly(flat, polygon, _MASK, cv2.LINE_8, FRACTION_BITS)
                     grey[index, mask] = _shrink(flat)
             start = plan
-        masks[:] = np.packbits((grey >= _MASK // 2).reshape(len(moments), 2, -1), axis=2)
+        masks[:] = np.packbits((grey >= _MASK // 2).reshape(*masks.shape[:2], -1), axis=2)
 
     def _boxes(
         self, moments: Moments, affines: Floats, heading: Floats
@@ -230,7 +226,7 @@ class Renderer:
         front, back = along + across, along - across
         middles = np.stack([column, row], axis=1)[:, None]
         corners = middles + np.stack([front, back, -front, -back], axis=1)
-        fixed = np.rint(corners * (1 << _SHIFT)).astype(np.int32)
+        fixed = np.rint(corners * (1 << FRACTION_BITS)).astype(np.int32)
 
         # A pose that stands where the next younger one stands is painted over by it: leave it out.
         number = np.full((len(moments), len(offsets) + 1, near.shape[2]), -1)
@@ -256,7 +252,7 @@ class Renderer:
         way = np.stack([np.interp(along, length, x), np.interp(along, length, y)], axis=1)
         width = max(1, round(ROUTE_WIDTH * self._window.scale))
         colour = _GREEN if light == GREEN else _RED  # yellow counts as red
-        cv2.polylines(canvas, [_fixed(way, affine)], False, colour, width, cv2.LINE_8, _SHIFT)  # noqa: FBT003
+        cv2.polylines(canvas, [fixed_point(way, affine)], False, colour, width, cv2.LINE_8, FRACTION_BITS)  # noqa: FBT003
 
 
 def _palette(history: int) -> Image:
@@ -282,12 +278,6 @@ def _shrink(picture: Image) -> Image:
     if picture.shape[0] != IMAGE:
         picture = cv2.resize(picture, (IMAGE, IMAGE), interpolation=cv2.INTER_AREA)
     return picture
-
-
-def _fixed(points: Floats, affine: Floats) -> NDArray[np.int32]:
-    """World points [..., 2] as cv2's fixed-point pixel coordinates."""
-    fixed: NDArray[np.int32] = np.rint((points @ affine[:, :2].T + affine[:, 2]) * (1 << _SHIFT)).astype(np.int32)
-    return fixed
 
 
 class _Map:
@@ -378,12 +368,12 @@ def _dashes(line: Floats) -> list[Floats]:
 
 
 def _paint(canvas: Image, shapes: Sequence[_Shape], affine: Floats, scale: float) -> None:
-    points = _fixed(np.concatenate([shape for shape, _, _ in shapes] or [np.empty((0, 2))]), affine)
+    points = fixed_point(np.concatenate([shape for shape, _, _ in shapes] or [np.empty((0, 2))]), affine)
     end = 0
     for shape, colour, metres in shapes:
         start, end = end, end + len(shape)
         if metres:
             width = max(1, round(metres * scale))
-            cv2.polylines(canvas, [points[start:end]], False, colour, width, cv2.LINE_8, _SHIFT)  # noqa: FBT003
+            cv2.polylines(canvas, [points[start:end]], False, colour, width, cv2.LINE_8, FRACTION_BITS)  # noqa: FBT003
         else:
-            cv2.fillConvexPoly(canvas, points[start:end], colour, cv2.LINE_8, _SHIFT)
+            cv2.fillConvexPoly(canvas, points[start:end], colour, cv2.LINE_8, FRACTION_BITS)

@@ -18,10 +18,11 @@ import pandas as pd
 from filelock import FileLock
 from numpy.typing import NDArray
 
+from study.config.heads import further_masks, mask_heads
 from study.config.keys import FORMAT_VERSIONS, content_key
 from study.config.settings import BirdviewSettings, FramesSettings
 from study.data.birdview import Renderer
-from study.data.frames import PARTS, SCHEMA_VERSION, SHAPES, DamagedFramesError, open_frames
+from study.data.frames import PARTS, SCHEMA_VERSION, DamagedFramesError, open_frames, shapes
 from study.data.selection import LABELS, SETS, Columns, candidates, choose, histograms
 from study.episode.files import episode_digest, file_digest, read_episode
 from study.errors import BadInputError
@@ -86,9 +87,15 @@ class _Build:
     @property
     def inputs(self) -> str:
         """Digest of all that decides the store's bytes."""
-        own = {"frames": self.frames.model_dump(mode="json", exclude={"unit"}), "sources": self.sources}
+        own: dict[str, Any] = {"frames": self.frames.model_dump(mode="json", exclude={"unit"}), "sources": self.sources}
         own |= {"birdview": self.birdview.model_dump(mode="json")}
+        if further_masks():
+            own["masks"] = further_masks()
         return content_key("frames", own, (), FORMAT_VERSIONS["frames"])
+
+    @property
+    def targets(self) -> list[str]:
+        return [head.target for head in mask_heads().values()]
 
     @property
     def draft(self) -> Path:
@@ -132,7 +139,7 @@ class _Build:
                 | {
                     "arrays": {
                         key: {"shape": [plan[name]["frames"], *shape], "dtype": "uint8"}
-                        for key, shape in SHAPES.items()
+                        for key, shape in shapes(len(self.targets)).items()
                     },
                     "parts": parts[name],
                 }
@@ -190,7 +197,7 @@ class _Build:
         return plan
 
     def _check_room(self) -> None:
-        each = sum(int(np.prod(shape)) for shape in SHAPES.values()) + 60
+        each = sum(int(np.prod(shape)) for shape in shapes(len(self.targets)).values()) + 60
         need = (self.frames.encoder + self.frames.policy) * each
         free = shutil.disk_usage(self.folder.parent).free
         if need > free:
@@ -202,7 +209,7 @@ class _Build:
     def _allocate(self, plan: dict[str, Any]) -> None:
         """Take the whole room at once, so that a full disk shows now and not in an hour."""
         for name in SETS:
-            for key, shape in SHAPES.items():
+            for key, shape in shapes(len(self.targets)).items():
                 path = self.draft / name / f"{key}.npy"
                 whole = (plan[name]["frames"], *shape)
                 length = _header(whole) + int(np.prod(whole))
@@ -228,7 +235,9 @@ class _Build:
                     continue
                 moments = np.stack([step[start:end], agent[start:end]], axis=1)
                 part = (self.paths[name][episode[start]], self.birdview, moments, self.draft / name, start)
-                tasks.append(Task(RENDER, _render_part, (*part, plan[name]["frames"], notes[-1]), end - start))
+                tasks.append(
+                    Task(RENDER, _render_part, (*part, plan[name]["frames"], notes[-1], self.targets), end - start)
+                )
         yield Batch(tasks, done)
         parts: dict[str, list[dict[str, Any]]] = {name: [] for name in SETS}
         for note in notes:  # in the order of their rows
@@ -260,19 +269,20 @@ def _render_part(
     start: int,
     frames: int,
     note: Path,
+    targets: Sequence[str],
 ) -> None:
     """Paint frames of one drive, [M, 2] of (step, agent id), into the rows from `start` on, and then note it."""
     episode = read_episode(path)
     positions = {agent.id: index for index, agent in enumerate(episode.agents)}
     where = np.array([(step, positions[agent]) for step, agent in moments.tolist()])
-    renderer = Renderer(episode, settings)
-    digests = {name: hashlib.sha256() for name in SHAPES}
+    renderer, arrays = Renderer(episode, settings, targets), shapes(len(targets))
+    digests = {name: hashlib.sha256() for name in arrays}
     with contextlib.ExitStack() as stack:
-        streams = {name: stack.enter_context((folder / f"{name}.npy").open("r+b")) for name in SHAPES}
-        for name, shape in SHAPES.items():
+        streams = {name: stack.enter_context((folder / f"{name}.npy").open("r+b")) for name in arrays}
+        for name, shape in arrays.items():
             streams[name].seek(_header((frames, *shape)) + start * int(np.prod(shape)))
         for first in range(0, len(where), CHUNK):
-            for name, array in zip(SHAPES, renderer.render(where[first : first + CHUNK]), strict=True):
+            for name, array in zip(arrays, renderer.render(where[first : first + CHUNK]), strict=True):
                 streams[name].write(array.data)
                 digests[name].update(array.data)
         for stream in streams.values():

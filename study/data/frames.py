@@ -5,7 +5,7 @@ A store is a folder, written once and then only read:
 `manifest.json`             key, settings, source drives with digests, counts, digests, histograms before and after
 `encoder/`, `policy/`       the two sets, from different drives, each with
     `images.npy`            [N, 64, 64, 3] uint8 RGB
-    `masks.npy`             [N, 2, 512] uint8: pred and plan, 4096 bits each, see `unpack_masks`
+    `masks.npy`             [N, 2, 512] uint8: pred, plan and those of further heads, 4096 bits each, see `unpack_masks`
     `labels.parquet`        one row for each frame, columns LABELS
 
 The main path is `frames_flow`: every drive is read once for its candidate moments, the frames are chosen from all of
@@ -32,7 +32,6 @@ from study.episode.files import file_digest
 from study.errors import BadInputError
 
 SCHEMA_VERSION = 1
-SHAPES = {"images": (IMAGE, IMAGE, 3), "masks": (2, MASK_BYTES)}
 PARTS = "parts"  # folder of the notes on what is painted
 
 # What a random generator is for; with a seed it makes the generator. `selection` has others.
@@ -95,6 +94,11 @@ class FrameStore:
     key: str
 
 
+def shapes(masks: int) -> dict[str, tuple[int, ...]]:
+    """Return the shape of one frame in each array of a store with that many masks."""
+    return {"images": (IMAGE, IMAGE, 3), "masks": (masks, MASK_BYTES)}
+
+
 def unpack_masks(masks: Bytes) -> Bytes:
     """Packed masks [B, 2, 512] as [B, 2, 64, 64] uint8 of 0 and 1: pred, plan."""
     return np.unpackbits(masks, axis=-1).reshape(*masks.shape[:-1], IMAGE, IMAGE)
@@ -131,7 +135,8 @@ def open_frames(folder: Path, *, check: bool = False) -> FrameStore:
 def _open_set(folder: Path, entry: dict[str, Any], *, check: bool) -> Frames:
     remedy = "study.sweep and study.data build make it anew"
     arrays = {}
-    for name, shape in SHAPES.items():
+    masks = entry["arrays"]["masks"]["shape"][1]
+    for name, shape in shapes(masks).items():
         path = folder / f"{name}.npy"
         try:
             array = np.load(path, mmap_mode="r", allow_pickle=False)
@@ -155,7 +160,7 @@ def _open_set(folder: Path, entry: dict[str, Any], *, check: bool) -> Frames:
     for part in entry["parts"] if check else ():
         rows = slice(part["start"], part["start"] + part["rows"])
         for name, array in arrays.items():
-            each = int(np.prod(SHAPES[name]))
+            each = int(np.prod(array.shape[1:]))
             content = np.fromfile(  # read, not mapped: all of a large store would count as this process's memory
                 folder / f"{name}.npy", np.uint8, part["rows"] * each, offset=array.offset + part["start"] * each
             )

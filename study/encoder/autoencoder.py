@@ -18,9 +18,14 @@ from torch.nn import functional
 from study.config.heads import HEAD_SETS, HEADS
 from study.config.paper import LATENT
 from study.config.settings import EncoderSettings
-from study.encoder.inputs import MASKS, Split, to_float, unpack
+from study.encoder.inputs import Split, mask_places, to_float, unpack
 from study.encoder.networks import PIXELS, Decoder, Encoder, initialise, seeded_generator
 from study.errors import one_of
+
+LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {  # by the name in a head's record; logits, target -> mean
+    "cross-entropy": functional.binary_cross_entropy_with_logits,
+    "squared-error": lambda logits, target: functional.mse_loss(logits.sigmoid(), target),
+}
 
 
 class MultiHeadAutoencoder(lightning.LightningModule):
@@ -41,6 +46,8 @@ class MultiHeadAutoencoder(lightning.LightningModule):
         self.head_weights = {head: settings.head_weights.get(head, 1.0) for head in HEAD_SETS[heads].heads}
         self.automatic_optimization = False  # gradients come head by head, see `losses`
         self.encoder = Encoder(variational=settings.beta > 0)
+        self._head_losses = {head: LOSSES[HEADS[head].loss] for head in self.head_weights}
+        self._mask_places = mask_places(self.head_weights)
         self.decoders = nn.ModuleDict({head: Decoder(HEADS[head].channels) for head in HEAD_SETS[heads].heads})
         initialise(self.encoder, seeded_generator(encoder_seed, "encoder"))
         for head, decoder in self.decoders.items():
@@ -65,7 +72,7 @@ class MultiHeadAutoencoder(lightning.LightningModule):
         other, so that memory for the activations of one head suffices.
         """
         pixels = to_float(images)
-        targets = {"rec": pixels} | unpack(masks, [head for head in self.decoders if head in MASKS])
+        targets = unpack(masks, self._mask_places)
         features = self.encoder.features(pixels)
         z = self.encoder.mean(features)
         ends: list[tuple[Tensor, Tensor | None]] = []  # of the encoder's graph, with the gradient that comes in there
@@ -81,7 +88,7 @@ class MultiHeadAutoencoder(lightning.LightningModule):
         parts = []
         weights = [self.head_weights[head] for head in self.decoders]
         for weight, (head, decoder) in zip(weights, self.decoders.items(), strict=True):
-            loss = functional.binary_cross_entropy_with_logits(decoder(given), targets[head])
+            loss = self._head_losses[head](decoder(given), targets.get(head, pixels))
             if by_head:
                 torch.autograd.backward(weight * loss)
             parts.append(loss.detach() if by_head else loss)

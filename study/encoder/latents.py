@@ -14,7 +14,7 @@ from study.compute.device import check_device
 from study.config.paper import LATENT
 from study.data.frames import Frames
 from study.encoder.autoencoder import MultiHeadAutoencoder
-from study.encoder.inputs import MASKS, Bytes, Indices, to_float, unpack
+from study.encoder.inputs import Bytes, Indices, mask_places, to_float, unpack
 from study.encoder.networks import Encoder
 from study.errors import BadInputError
 from study.products import Arrays
@@ -25,7 +25,7 @@ SAMPLES = 16
 def choose_samples(frames: Frames) -> Indices:
     """Rows of up to 16 test frames to show, the same for every encoder: those with most to see, drive by drive.
 
-    A frame's content is the mean of two ranks among the test frames: set pixels in its pred and in its plan mask.
+    A frame's content is the sum of its ranks among the test frames by the set pixels of each mask.
     """
     test = frames.indices("test")
     pixels = np.bitwise_count(frames.masks[test]).sum(axis=2, dtype=np.int64)
@@ -47,7 +47,7 @@ def paint_samples(module: MultiHeadAutoencoder, frames: Frames, rows: Indices) -
     for head, output in outputs.items():
         painted = output.mul(255).round().to(torch.uint8).permute(0, 2, 3, 1)
         samples[f"{head}_output"] = painted.squeeze(-1).contiguous().numpy()
-    for head, target in unpack(masks, [head for head in outputs if head in MASKS]).items():
+    for head, target in unpack(masks, mask_places(outputs)).items():
         samples[f"{head}_target"] = target.mul(255).to(torch.uint8).squeeze(1).numpy()
     return samples
 

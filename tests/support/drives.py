@@ -12,6 +12,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from study.config.settings import BirdviewSettings
+from study.data.birdview import Renderer
+from study.data.frames import unpack_masks
 from study.episode.files import write_episode
 from study.episode.schema import GREEN, RED, YELLOW, Agent, Episode, Lane, Light, empty_states
 
@@ -141,3 +144,12 @@ def write_drives(folder: Path, count: int, first_seed: int = 0, cars: int = 12, 
     for number, path in enumerate(paths):
         write_episode(crossing_drive(first_seed + number, cars, steps, path.name), path)
     return paths
+
+
+def bird_view(
+    episode: Episode, step: int, agent: int, settings: BirdviewSettings
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return one moment as image [64, 64, 3] uint8 and the masks pred and plan, [64, 64] bool."""
+    images, masks = Renderer(episode, settings).render(np.array([[step, agent]]))
+    pred, plan = unpack_masks(masks[0]).astype(bool)
+    return images[0], pred, plan
