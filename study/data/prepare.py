@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from study.config.heads import load_heads
 from study.config.keys import drive_name, frames_key, recording_key
 from study.config.settings import StudySettings
 from study.config.workspace import DATA
@@ -91,12 +92,15 @@ def drives_flow(settings: StudySettings, root: Path = DATA) -> Flow[list[Path]]:
     return (yield from record_flow(settings.town, recording, seeds, folder))
 
 
-def describe_data(folder: Path, drives: Path, settings: StudySettings, imported: Imported | None) -> Described:
+def describe_data(
+    folder: Path, drives: Path, settings: StudySettings, imported: Imported | None, head_modules: Sequence[str] = ()
+) -> Described:
     """Return the manifest of the frame store and the files of its data card by name; makes what is missing."""
     from study.data.card import card_files, source_drives  # noqa: PLC0415 - pictures, which training needs not
     from study.data.frames import open_frames  # noqa: PLC0415
 
     if not (folder / "manifest.json").is_file():
+        load_heads(head_modules)
         run_flow(data_flow(settings, DATA, imported))
     store = open_frames(folder)
     files = card_files(store, source_drives(store, drives), folder)

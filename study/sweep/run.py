@@ -121,7 +121,9 @@ def _data_flow(plan: Plan, engine: Engine) -> Flow[Any]:
     """Make and describe the frames: here, with the engine's help, unless its workers have folders of their own."""
     if _shares_folder(engine):
         yield from data_flow(plan.settings, DATA, plan.imported)
-    task = Task(DESCRIBE, describe_data, (plan.frames, plan.drives, plan.settings, plan.imported))
+    task = Task(
+        DESCRIBE, describe_data, (plan.frames, plan.drives, plan.settings, plan.imported, plan.grid.head_modules)
+    )
     (described,) = yield Batch([task])
     return described
 

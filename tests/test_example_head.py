@@ -1,0 +1,61 @@
+"""A fifth head, added without a change to the program, goes from its record to the report."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from pypdf import PdfReader
+
+from study.config.grid import Grid
+from study.config.heads import HEAD_SETS, HEADS
+from study.config.settings import BirdviewSettings
+from study.data.birdview import Renderer, valid_moments
+from study.data.frames import unpack_masks
+from study.errors import BadInputError
+from tests.support.drives import crossing_drive
+from tests.support.processes import ROOT, sweep
+from tests.support.sweeps import working_folder
+
+TARGET = "examples.light_head:lights_ahead"
+
+
+def test_a_further_mask_leaves_the_papers_as_they_are() -> None:
+    episode, settings = crossing_drive(0), BirdviewSettings()
+    moments = valid_moments(episode, settings)[::5]
+    images, masks = Renderer(episode, settings).render(moments)
+    same_images, more_masks = Renderer(episode, settings, ["pred", "plan", TARGET]).render(moments)
+    np.testing.assert_array_equal(images, same_images)
+    np.testing.assert_array_equal(masks, more_masks[:, :2])
+    assert 0 < unpack_masks(more_masks)[:, 2].mean() < 0.1
+
+
+def test_a_sweep_with_the_example_ends_with_its_report(tmp_path: Path) -> None:
+    working_folder(tmp_path)
+    shutil.copy(ROOT / "examples/light.yaml", tmp_path / "sweeps")
+    words = ("light", "--profile", "tiny", "--policy_seeds", "2", "--ceiling", "false")
+    completed = sweep(tmp_path, *words, "--heads", "[rec,rec+light]", "--workers", "2")
+    assert completed.returncode == 0, completed.stderr
+    (manifest,) = (json.loads(path.read_text()) for path in tmp_path.glob("data/frames/*/manifest.json"))
+    assert manifest["sets"]["encoder"]["arrays"]["masks"]["shape"] == [40, 3, 512]
+    curves = pd.read_parquet(tmp_path / "reports/light/curves.parquet")
+    metrics = curves[curves["stage"] == "encoder"].groupby("heads")["metric"].unique()
+    assert set(metrics["rec+light"]) == {"loss", "loss_rec", "loss_light"}
+    text = "".join(page.extract_text() for page in PdfReader(tmp_path / "reports/light.pdf").pages)
+    assert "rec+light" in text
+
+
+@pytest.mark.parametrize(
+    ("modules", "says"),
+    [(["no_such_module"], "no_such_module.* cannot be used"), (["study.errors"], "needs HEADS and HEAD_SETS")],
+)
+def test_a_module_without_records_is_refused(modules: list[str], says: str) -> None:
+    with pytest.raises(BadInputError, match=says):
+        Grid.model_validate({"name": "x", "title": "X", "heads": ["rec"], "head_modules": modules})
+
+
+def test_the_program_itself_has_the_papers_heads() -> None:
+    assert list(HEADS) == ["rec", "pred", "plan"]
+    assert list(HEAD_SETS) == ["rec", "rec+pred", "rec+plan", "full"]
