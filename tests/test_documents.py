@@ -5,7 +5,7 @@ Each page's code blocks are tried in a newcomer's working folder:
 - YAML whose first line is `# PATH` is written to PATH; Python is run.
 - `python -m study.sweep NAME` is run with `--dry-run`, `study.data import` as it stands. The options of every other
   command of the study are parsed, and a sweep's plan is made.
-- `make TARGET` is run with make's own `--dry-run`. Blocks of shell tools alone are run.
+- `make TARGET` is run with make's own `--dry-run`. `cp` and blocks of shell tools alone are run.
 - Commands with the profile `smoke` and blocks below `<!-- test: stress -->` are run to their end by `make stress`.
 - Blocks below `<!-- test: skip, REASON -->` are not run. Anything else is an error.
 """
@@ -135,6 +135,8 @@ def run_commands(block: Block, folder: Path, patch: pytest.MonkeyPatch) -> None:
     for words in commands:
         if words[0] == "make":
             subprocess.run(["make", "--dry-run", *words[1:]], cwd=ROOT, check=True, capture_output=True)
+        elif words[0] == "cp":
+            subprocess.run(words, cwd=folder, check=True, capture_output=True)
         else:
             assert words[:2] == ["python", "-m"], f"{block.place}: no rule runs '{words[0]}'; mark the block"
             assert words[2].startswith("study."), f"{block.place}: no rule runs '{words[2]}'; mark the block"
