@@ -4,7 +4,7 @@ VENV := .venv
 RUN := $(VENV)/bin/python
 ARGS ?=
 
-.PHONY: help heads datasize test stress format lock
+.PHONY: help install heads datasize test stress docs format lock
 .DEFAULT_GOAL := help
 
 help: ## this list
@@ -15,6 +15,8 @@ $(VENV)/.installed: requirements.lock pyproject.toml
 	$(RUN) -m pip install --quiet --requirement requirements.lock
 	$(RUN) -m pip install --quiet --no-deps --editable .
 	touch $@
+
+install: $(VENV)/.installed ## install the program and its tools into .venv
 
 heads: $(VENV)/.installed ## the main job: effect of different heads, ends in reports/heads.pdf
 	$(RUN) -m study.sweep heads $(ARGS)
@@ -31,6 +33,9 @@ test: $(VENV)/.installed ## lint, types and the tests
 
 stress: $(VENV)/.installed ## the long tests: kills, clusters, a browser, other machines
 	$(RUN) -m pytest -m stress $(ARGS)
+
+docs: $(VENV)/.installed ## the documentation as a site, in site/
+	$(VENV)/bin/mkdocs build --strict
 
 format: $(VENV)/.installed ## put the code into its one form
 	$(VENV)/bin/ruff format .
