@@ -55,7 +55,7 @@ def thinned(episode, every):
     return dataclasses.replace(episode, rate_hz=episode.rate_hz / every, **part)
 
 
-def test_a_whole_drive_at_10_hz_stays_as_it_is(drive):
+def test_a_drive_at_10_hz_stays_as_it_is(drive):
     adapted = adapt(drive, "drive")
     assert (adapted.derived, adapted.skipped, adapted.egos) == (0, 0, 6)
     assert adapted.episode.labels == "recorded"
@@ -238,7 +238,7 @@ def test_the_sets_share_no_drive_and_each_can_be_split(folder, tmp_path):
     assert not set(encoder) & set(policy)
 
 
-def test_too_few_drives_are_told_with_what_is_needed(folder, tmp_path):
+def test_too_few_drives_are_reported_with_what_is_needed(folder, tmp_path):
     imported = import_drives(folder, tmp_path / "out")
     with pytest.raises(BadInputError, match="needs 4 or more"):
         dataclasses.replace(imported, drives=imported.drives[:3]).assign(FramesSettings())
@@ -263,13 +263,13 @@ def test_imported_drives_become_the_frames_of_a_sweep(folder, tmp_path):
     assert not (tmp_path / "episodes").exists()
 
 
-def test_drives_that_give_too_few_frames_are_told_with_the_setting(folder, tmp_path):
+def test_drives_that_give_too_few_frames_are_reported_with_the_setting(folder, tmp_path):
     imported = import_drives(folder, tmp_path / "out")
     with pytest.raises(BadInputError, match=r"needs \d+ .*frames.*lower --frames\.encoder"):
         run_flow(data_flow(load_profile("smoke"), tmp_path, imported))
 
 
-def test_a_drive_that_has_changed_since_is_told(folder, tmp_path):
+def test_a_drive_that_has_changed_since_is_reported(folder, tmp_path):
     imported = import_drives(folder, tmp_path / "out")
     shutil.copy(folder / "drive-000" / "episode.json", tmp_path / "out" / "drive-001" / "episode.json")
     with pytest.raises(BadInputError, match="drive-001 is not what was imported"):

@@ -314,7 +314,7 @@ def test_an_epoch_takes_each_frame_once_in_even_batches(frames: Frames) -> None:
     assert not np.array_equal(np.concatenate(parts), np.concatenate(plan.parts(1)))
 
 
-def test_the_step_budget_keeps_the_steps_of_the_whole_data(frames: Frames) -> None:
+def test_the_step_budget_keeps_the_steps_of_all_the_data(frames: Frames) -> None:
     settings = SETTINGS.model_copy(update={"budget": "steps"})
     all_data = plan_training(frames, 1.0, 0, settings, FRAMES)
     quarter = plan_training(frames, 0.25, 0, settings, FRAMES)
@@ -394,7 +394,7 @@ def test_what_cannot_be_compiled_trains_without_after_one_warning(
         assert_same_step(frames, "rec+plan", 0.0, 0.0)
 
 
-def test_inside_an_epoch_nobody_waits_for_the_device(frames: Frames, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_inside_an_epoch_nothing_waits_for_the_device(frames: Frames, monkeypatch: pytest.MonkeyPatch) -> None:
     reads = record_synchronisations(monkeypatch, MultiHeadAutoencoder, "training_step", "validation_step")
     train(frames, "full", SETTINGS.model_copy(update={"beta": 0.5}))
     assert reads == []
@@ -490,7 +490,7 @@ def test_a_checkpoint_serves_settings_that_make_no_difference(frames: Frames, tm
 
 
 @pytest.mark.parametrize("damage", [lambda raw: raw[:1000], lambda raw: b"", lambda raw: raw[:-9000] + bytes(9000)])
-def test_a_damaged_checkpoint_is_told_and_not_used(
+def test_a_damaged_checkpoint_is_reported_and_not_used(
     frames: Frames, tmp_path: Path, damage: Callable[[bytes], bytes], capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "checkpoint"
@@ -548,7 +548,7 @@ def test_too_little_device_memory_names_the_setting_that_lowers_it(frames: Frame
         train_encoder(frames, "rec", 1.0, 0, SETTINGS, FRAMES, **where)
 
 
-def test_what_cannot_be_used_is_refused_with_the_way_out(frames: Frames) -> None:
+def test_unusable_input_is_refused_with_the_way_out(frames: Frames) -> None:
     with pytest.raises(BadInputError, match=r"unknown head set 'rec[+]plam'; choose from rec, rec"):
         train(frames, "rec+plam")
     with pytest.raises(BadInputError, match=r"batch 500 is larger than the 128 training frames.*--encoder.batch"):

@@ -42,7 +42,7 @@ def test_the_same_store_gives_the_same_bytes(small_store, small_drives):
     assert not list(small_store.glob(".card*"))
 
 
-def test_a_card_that_is_there_is_not_made_again(small_store, small_drives):
+def test_a_card_that_exists_is_not_made_again(small_store, small_drives):
     files = card_files(open_frames(small_store), small_drives, small_store)
     before = [file.stat().st_mtime_ns for file in files]
     assert [

@@ -125,7 +125,7 @@ def test_frames_of_another_plan_are_refused(new_job):
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU is there")
 @pytest.mark.parametrize("device", ["cuda", "cuda:0", "cuda:1"])
-def test_a_gpu_that_is_not_there_is_refused_and_never_replaced_by_the_cpu(new_job, device):
+def test_a_gpu_that_does_not_exist_is_refused_and_never_replaced_by_the_cpu(new_job, device):
     with pytest.raises(BadInputError, match="choose from cpu"):
         run(new_job(device=device))
 

@@ -147,7 +147,7 @@ def test_certificates_that_do_not_match_are_one_clear_error(cluster, tmp_path):
 YAML = "class: {name}\narguments: {{cores: 1, memory: 2GB}}\nworkers: 2\n"
 
 
-def test_a_batch_system_that_is_not_there_is_one_clear_error(tmp_path):
+def test_a_batch_system_that_does_not_exist_is_one_clear_error(tmp_path):
     folder = working_folder(tmp_path / "client")
     (folder / "slurm.yaml").write_text(YAML.format(name="SLURMCluster"))
     completed = sweep(folder, "heads", "--profile", "tiny", "--cluster", "slurm.yaml")

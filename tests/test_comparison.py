@@ -137,7 +137,7 @@ def test_cells_of_one_sweep_only_are_named(content):
     assert row(text, "100 %")[3] == "the same"
 
 
-def test_cells_at_different_fractions_are_told_apart(content):
+def test_cells_at_different_fractions_are_distinguished(content):
     half = checked(made(simulate(SMALL.model_copy(update={"fractions": (0.5,)}), FAST)), "half")
     text = compared(checked(content, "all"), half, ("all", "half"))
     assert "Only in the first: rec at 100 %, full at 100 %." in text
@@ -146,7 +146,7 @@ def test_cells_at_different_fractions_are_told_apart(content):
     assert "### Convergence" not in text
 
 
-def test_nothing_in_common_is_said(content):
+def test_two_sweeps_without_a_common_cell_are_reported(content):
     grid = SMALL.model_copy(update={"heads": ("rec+plan",)})
     text = compared(checked(content, "a"), checked(made(simulate(grid, FAST)), "b"), ("a", "b"))
     assert "No head set and fraction is finished in both" in text
@@ -173,7 +173,7 @@ def test_words_of_a_report_stay_words(content):
         ({"scores": None}, "scores"),
     ],
 )
-def test_a_report_that_is_not_whole_is_refused_by_name(content, change, message, tmp_path):
+def test_a_report_that_is_incomplete_is_refused_by_name(content, change, message, tmp_path):
     (tmp_path / "report.json").write_text(json.dumps(content | change))
     with pytest.raises(BadInputError, match=rf"report\.json.*{message}"):
         read_report(tmp_path)

@@ -85,7 +85,7 @@ def test_a_new_render_spec_keeps_the_drives_and_changes_the_frames():
     assert frames_key(one) != frames_key(other)
 
 
-def test_more_drives_keep_the_drives_there_are():
+def test_more_drives_keep_existing_drives():
     assert recording_key(StudySettings()) == recording_key(changed(recording={"encoder_episodes": 99}))
 
 

@@ -30,7 +30,7 @@ def with_variant(record, **more):
     return replace(record, variants={SPLIT.setting: replace(other, grid=grid)})
 
 
-def test_settings_that_differ_in_one_confound_alone_are_told_from_others():
+def test_settings_that_differ_in_one_confound_alone_are_recognised():
     plain = StudySettings()
     assert varied(plain, changed(frames={"split": "frame"})) is SPLIT
     assert varied(changed(frames={"split": "frame"}), plain) is SPLIT

@@ -47,7 +47,7 @@ def contents(folder):
 
 
 @pytest.mark.parametrize("workers", [2, 4])
-def test_drives_and_frames_are_the_same_bytes_whoever_makes_them(settings, root, tmp_path, workers):
+def test_drives_and_frames_are_the_same_bytes_with_any_number_of_workers(settings, root, tmp_path, workers):
     """Recording, choosing and rendering by Dask's workers, against this process alone."""
     with local_engine(workers, tmp_path / "scratch") as engine:
         folder = run_flow(data_flow(settings, tmp_path / "data"), engine)
@@ -56,7 +56,7 @@ def test_drives_and_frames_are_the_same_bytes_whoever_makes_them(settings, root,
     assert contents(tmp_path / "data") == contents(root)
 
 
-def test_what_is_there_is_not_made_again(settings, root):
+def test_existing_data_is_not_made_again(settings, root):
     steps = []
     run_flow(data_flow(settings, root), progress=lambda *what: steps.append(what))
     assert steps == []
@@ -68,14 +68,14 @@ def test_progress_reaches_the_end(settings, tmp_path):
     assert [stage for stage, done, total in steps if done == total] == ["record", "select", "render"]
 
 
-def test_drives_that_are_there_need_no_simulator(settings, root, tmp_path, monkeypatch):
+def test_drives_that_exist_need_no_simulator(settings, root, tmp_path, monkeypatch):
     shutil.copytree(root / "episodes", tmp_path / "episodes")
     monkeypatch.setitem(sys.modules, "study.sim.record", None)
     again = open_frames(run_flow(data_flow(settings, tmp_path)))
     assert again.manifest == open_frames(frames_folder(settings, root)).manifest
 
 
-def test_a_damaged_store_is_told_and_made_again(settings, root, tmp_path, capsys):
+def test_a_damaged_store_is_reported_and_rebuilt(settings, root, tmp_path, capsys):
     shutil.copytree(root, tmp_path / "data")
     images = frames_folder(settings, tmp_path / "data") / "encoder" / "images.npy"
     content = images.read_bytes()
@@ -85,7 +85,7 @@ def test_a_damaged_store_is_told_and_made_again(settings, root, tmp_path, capsys
     assert images.read_bytes() == content
 
 
-def test_a_full_disk_is_told_before_anything_is_made(settings, tmp_path, monkeypatch):
+def test_a_full_disk_is_reported_before_anything_is_made(settings, tmp_path, monkeypatch):
     monkeypatch.setattr("study.data.prepare.shutil.disk_usage", lambda _: SimpleNamespace(free=1000))
     with pytest.raises(BadInputError, match="free"):
         run_flow(data_flow(settings, tmp_path))
@@ -99,7 +99,7 @@ def test_room_that_a_killed_build_has_taken_is_not_asked_for_again(settings, roo
     assert (run_flow(data_flow(settings, tmp_path)) / "manifest.json").is_file()
 
 
-def test_a_folder_that_cannot_be_made_is_told(settings, tmp_path):
+def test_a_folder_that_cannot_be_made_is_reported(settings, tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(BadInputError, match="cannot write"):
         run_flow(data_flow(settings, tmp_path / "file" / "data"))

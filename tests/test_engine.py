@@ -90,7 +90,7 @@ def test_results_come_from_other_processes_in_the_order_of_the_tasks(engine):
     assert os.getpid() not in processes
 
 
-def test_whatever_a_task_reports_is_heard_before_its_end(engine):
+def test_whatever_a_task_reports_is_delivered_before_its_end(engine):
     events = run_and_record(engine, {str(number): flow(work, (3,), reports=True) for number in range(12)})
     losses = [(name, epoch, metrics["loss"]) for name, _, epoch, metrics in events.logs]
     assert sorted(losses) == sorted((str(number), step, 1 / step) for number in range(12) for step in (1, 2, 3))
@@ -206,7 +206,7 @@ def test_certificates_that_are_missing_are_named(tmp_path):
         cluster_engine("tls://127.0.0.1:8786", tmp_path)
 
 
-def test_certificates_that_are_none_are_one_clear_error(tmp_path, monkeypatch):
+def test_invalid_certificates_are_one_clear_error(tmp_path, monkeypatch):
     monkeypatch.setattr(remote, "CONNECT", 0.5)
     for name in ("ca.pem", "cert.pem", "key.pem"):
         (tmp_path / name).write_text("none")

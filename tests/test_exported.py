@@ -88,7 +88,7 @@ def test_a_latent_of_unit_length_is_exported_as_such():
     assert_says_the_same(torch.export.load(io.BytesIO(export_driver(result))).module(), result, 3)
 
 
-def test_the_network_runs_where_there_is_only_torch(file, tmp_path):
+def test_the_network_runs_with_torch_alone(file, tmp_path):
     code = (
         f"import sys, torch; driver = torch.export.load({str(file)!r}).module();"
         "print(tuple(driver(torch.zeros(4, 3, 64, 64))['acceleration'].shape), 'study' in sys.modules)"

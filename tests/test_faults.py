@@ -133,7 +133,7 @@ def test_a_client_that_stands_still_for_a_while_does_no_harm(undisturbed, tmp_pa
     assert_same_outcome(folder, undisturbed.folder)
 
 
-def test_of_two_clients_started_at_once_one_works_and_one_is_told(undisturbed, tmp_path):
+def test_of_two_clients_started_at_once_one_works_and_one_is_refused(undisturbed, tmp_path):
     folder = undisturbed.copy(tmp_path)
     twins = [CommandProcess(folder, *sweep_command(*TWO), log=tmp_path / f"log{number}") for number in range(2)]
     codes = [twin.wait() for twin in twins]
@@ -142,7 +142,7 @@ def test_of_two_clients_started_at_once_one_works_and_one_is_told(undisturbed, t
     assert_same_outcome(folder, undisturbed.folder)
 
 
-def test_a_second_client_waits_when_told_to(undisturbed, tmp_path):
+def test_a_second_client_waits_with_the_option(undisturbed, tmp_path):
     folder = undisturbed.copy(tmp_path)
     twins = [
         CommandProcess(folder, *sweep_command(*TWO), "--wait", log=tmp_path / f"log{number}") for number in range(2)
@@ -191,7 +191,7 @@ def test_a_cell_that_kills_its_worker_is_given_up_and_the_others_finish(undistur
     assert_same_outcome(folder, undisturbed.folder)
 
 
-def test_damaged_files_are_told_and_made_again(undisturbed, tmp_path):
+def test_damaged_files_are_reported_and_rebuilt(undisturbed, tmp_path):
     """A frame, a checkpoint and a kept product, damaged between two starts."""
     folder = undisturbed.copy(tmp_path)
     (image,) = folder.glob("data/frames/*/encoder/images.npy")
@@ -326,7 +326,7 @@ def disk(tmp_path):
     small_disk.remove()
 
 
-def test_a_full_disk_is_told_at_every_stage_and_costs_nothing(undisturbed, disk, tmp_path):
+def test_a_full_disk_is_reported_at_every_stage_and_costs_nothing(undisturbed, disk, tmp_path):
     working_folder(disk.folder)
     for stage in ("record", "render", "encoder", "commit"):
         run = CommandProcess(disk.folder, *sweep_command(*TWO), log=tmp_path / "log")

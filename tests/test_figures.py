@@ -106,7 +106,7 @@ def test_saved_files_are_svg_and_png_and_nothing_is_left_beside_them(heads_figur
     assert {path.name for path in tmp_path.iterdir()} == {"f.svg", "f.png"}
 
 
-def test_a_figure_is_written_whole_in_the_format_of_its_ending(tmp_path):
+def test_a_figure_is_written_atomically_in_the_format_of_its_ending(tmp_path):
     for ending, start in ((".svg", b"<?xml"), (".PNG", b"\x89PNG"), (".pdf", b"%PDF")):
         contents = []
         for name in ("one", "two"):

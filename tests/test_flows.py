@@ -255,7 +255,7 @@ def reporting(*event_lists, weights=None):
     ]
 
 
-def test_every_start_is_told_with_host_and_process():
+def test_every_start_is_reported_with_host_and_process():
     assert run({"a": steps([], "a", 2)}).starts == [("a", platform.node(), os.getpid())] * 2
 
 
@@ -266,7 +266,7 @@ def test_logged_means_are_over_the_weights_of_the_tasks():
     assert events.logs == [("a", "policy", 1, {"loss": 3.0, "accuracy": 0.25})]
 
 
-def test_an_epoch_is_told_when_all_tasks_have_reported_it_and_no_sooner():
+def test_an_epoch_is_reported_when_all_tasks_have_reported_it_and_no_sooner():
     ahead = [("log", epoch, {"loss": 1.0}) for epoch in (1, 2, 3)]
     behind = [("log", epoch, {"loss": 3.0}) for epoch in (1, 2)]
     events = run({"a": iter_batch(reporting(ahead, behind)), "b": iter_batch(reporting(behind))})
@@ -295,7 +295,7 @@ def test_progress_counts_the_weights_and_what_was_done_before():
     assert run({"a": flow()}).steps == [("latents", 60, 100), ("latents", 70, 100), ("latents", 100, 100)]
 
 
-def test_progress_that_tasks_report_is_told_in_their_own_steps():
+def test_progress_that_tasks_report_is_reported_in_their_own_steps():
     halves = [("progress", 5, 20), ("progress", 20, 20)]
     steps = run({"a": iter_batch(reporting(halves, halves, weights=[3, 1]))}).steps
     assert steps[1:] == [("policy", part, 20) for part in (3, 15, 15, 16, 20, 20)]

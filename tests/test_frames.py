@@ -237,7 +237,7 @@ def fewer(path):
         ("policy/labels.parquet", Path.unlink, "holds no labels"),
     ],
 )
-def test_a_store_that_is_not_whole_is_refused(store, file, change, says):
+def test_a_store_that_is_incomplete_is_refused(store, file, change, says):
     change(store / file)
     with pytest.raises(BadInputError, match=says):
         open_frames(store)

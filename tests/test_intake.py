@@ -177,7 +177,7 @@ def test_a_spoilt_result_is_named_before_anything_is_committed(plan, folder, how
 @pytest.mark.parametrize(
     ("name", "said"), [("nowhere", "no folder"), ("sweeps", "no cell results"), ("sweeps/heads.yaml", "no folder")]
 )
-def test_a_folder_without_results_is_told(here, plan, name, said):
+def test_a_folder_without_results_is_reported(here, plan, name, said):
     with pytest.raises(BadInputError, match=said):
         main([*PLAN, "--import-results", name])
     assert not list(here.glob("mlruns/*.db"))

@@ -58,7 +58,7 @@ def test_the_ceiling_has_a_row_and_scores_their_share_of_the_way_to_it(report):
         assert cells(text, score.cell)[at] == f"{100 * gained:.0f}"
 
 
-def test_without_a_ceiling_there_is_no_word_of_it():
+def test_without_a_ceiling_it_is_not_mentioned():
     text = written(summarise(simulate(HEADS_GRID.model_copy(update={"ceiling": False}), World(epochs=6))))
     assert "| Cell | n | accuracy" in text
     assert "eiling" not in text

@@ -123,7 +123,7 @@ def test_nothing_is_running_when_the_sweep_has_ended(server, experiment):
 
 
 @pytest.mark.parametrize("metric", [ACCURACY, STEERING])
-def test_a_comparison_of_the_cells_gets_a_whole_mean_curve_of_each(server, cells, metric):
+def test_a_comparison_of_the_cells_gets_a_complete_mean_curve_of_each(server, cells, metric):
     names = [("run_ids", run["info"]["run_id"]) for run in cells.values()]
     words = urllib.parse.urlencode([*names, ("metric_key", metric), ("max_results", 320)])
     points = api(server, f"metrics/get-history-bulk-interval?{words}")["metrics"]

@@ -109,7 +109,7 @@ def test_all_seeds_as_one_group_come_out_as_one_group_each(
     )
 
 
-def test_inside_an_epoch_nobody_waits_for_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_inside_an_epoch_nothing_waits_for_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
     """The way of a GPU: no number leaves it before the epoch's end."""
     reads = record_synchronisations(monkeypatch, ensemble.PolicyEnsemble, "training_step")
     monkeypatch.setattr(ensemble, "_groups", lambda seeds, device: [slice(0, seeds)])

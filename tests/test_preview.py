@@ -25,7 +25,7 @@ def test_both_files_are_pictures_and_the_same_each_time(small_store, small_drive
     assert sorted(path.name for path in small_store.iterdir() if path.name.startswith(".")) == []
 
 
-def test_a_store_whose_drives_are_gone_is_told(small_store):
+def test_a_store_whose_drives_are_gone_is_reported(small_store):
     with pytest.raises(BadInputError, match="build it again"):
         write_preview(open_frames(small_store), [], small_store)
 
@@ -73,7 +73,7 @@ def test_lights_are_on_the_map_in_their_colours(tmp_path):
     assert near[0] == 0 < 4 * 12 <= near[2]
 
 
-def test_who_may_not_be_ego_is_not_followed():
+def test_an_agent_that_may_not_be_ego_is_not_followed():
     episode = crossing_drive(steps=20)
     ego, _ = choose_ego(episode)
     others = tuple(dataclasses.replace(agent, ego=index != ego) for index, agent in enumerate(episode.agents))

@@ -79,14 +79,14 @@ def test_a_foreign_head_is_refused(folder, head):
         read(folder)
 
 
-def test_a_product_from_before_there_were_digests_is_read(folder):
+def test_a_product_without_digests_is_read(folder):
     head = json.loads((folder / "head.json").read_text())
     del head["digests"]
     (folder / "head.json").write_text(json.dumps(head))
     assert read(folder)[0] == HEAD
 
 
-def test_a_folder_that_is_not_there_is_refused(tmp_path):
+def test_a_folder_that_does_not_exist_is_refused(tmp_path):
     with pytest.raises(BadInputError, match="is not a whole product"):
         read(tmp_path / "nothing")
 

@@ -84,7 +84,7 @@ def test_a_checkout_around_the_code_is_not_its_own(checkout):
     assert (facts["commit"], facts["dirty"]) == (None, False)
 
 
-def test_no_user_or_host_name_is_told(checkout):
+def test_no_user_or_host_name_is_recorded(checkout):
     text = json.dumps({name: value for name, value in provenance(checkout).items() if name != "packages"})
     assert platform.node() not in text
     assert getpass.getuser() not in text

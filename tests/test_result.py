@@ -41,7 +41,7 @@ def test_loading_gives_what_was_saved(record, folder):
 
 @pytest.mark.parametrize("file", ["cell.json", "curves.parquet", *(f"{part}.safetensors" for part in ARRAYS)])
 @pytest.mark.parametrize("how", ["missing", "truncated"])
-def test_what_is_not_whole_is_refused(folder, file, how):
+def test_an_incomplete_result_is_refused(folder, file, how):
     path = folder / file
     if how == "missing":
         path.unlink()

@@ -90,7 +90,7 @@ def test_without_a_hold_the_brake_may_be_shorter() -> None:
     assert single.any()
 
 
-def test_nobody_crosses_a_stop_line_at_red(town: Drive) -> None:
+def test_no_vehicle_crosses_a_stop_line_at_red(town: Drive) -> None:
     assert town.ran_red == 0
 
 
@@ -206,7 +206,7 @@ def test_cross_traffic_waits_for_a_vehicle_left_inside_the_junction() -> None:
     assert road.collided == 0
 
 
-def test_nobody_enters_a_junction_that_has_no_room_behind_it() -> None:
+def test_no_vehicle_enters_a_junction_that_has_no_room_behind_it() -> None:
     road = make_traffic(TownSettings(vehicles=12, green=20.0), 0)
     town = road.town
     way = next(
@@ -228,7 +228,7 @@ def test_nobody_enters_a_junction_that_has_no_room_behind_it() -> None:
     assert road.fleet.s[0] + LENGTH / 2 <= road.fleet.move_start[0]
 
 
-def test_who_was_denied_its_green_goes_first_into_the_same_street() -> None:
+def test_a_vehicle_that_was_denied_its_green_goes_first_into_the_same_street() -> None:
     road = make_traffic(TownSettings(vehicles=2), 0)
     moves = road.town.movements
     denied, greedy = next(

@@ -57,7 +57,7 @@ def test_datasize_reuses_the_cells_of_heads(folder):
 
 
 @pytest.mark.stress
-def test_a_failed_cell_leaves_the_others_is_told_and_runs_again_when_asked_for(undisturbed, tmp_path):
+def test_a_failed_cell_is_reported_leaves_the_others_alone_and_runs_again_on_request(undisturbed, tmp_path):
     undisturbed.copy(tmp_path)
     words = (*FOUR_CELLS, "--heads", "[rec,rec+pred]", "--encoder.lr", "1e30", "--no-report")
     for more, tries in ((), 2), ((), 2), (("--retry-failed",), 4):
@@ -93,7 +93,7 @@ def test_a_finished_cell_computed_again_has_the_same_bytes(undisturbed):
     assert kept() == before
 
 
-def test_a_result_tells_what_made_it(folder):
+def test_a_result_records_its_origin(folder):
     tracker = Tracker(f"sqlite:///{folder}/mlruns/mlflow.db")
     facts = next(iter(tracker.reader.read_sweep("heads").results.values())).facts
     assert facts["threads"] == 1

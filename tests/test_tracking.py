@@ -233,7 +233,7 @@ def test_a_list_of_runs_reads_well(tracker):
     assert "mlflow.user" not in run.data.tags
 
 
-def test_the_view_of_all_cells_shows_columns_that_there_are(tracker):
+def test_the_view_of_all_cells_shows_existing_columns(tracker):
     planned = cells("view")
     run = tracker.client.get_run(train(tracker, open_sweep(tracker, planned), planned, "view-0"))
     view = json.loads(tracker.client.get_experiment(tracker.experiment.id).tags["mlflow.sharedViewState.cells"])
@@ -310,7 +310,7 @@ def test_a_new_attempt_closes_what_a_killed_one_left(tracker):
     assert names == {"rec 100% e0", "rec 100% e0 (attempt 1)"}
 
 
-def test_of_two_attempts_that_finish_the_first_counts(tracker):
+def test_of_two_finished_attempts_the_first_counts(tracker):
     """A worker stopped beyond its time comes back and commits; the one in its place comes second."""
     planned = cells("late")
     sweep = open_sweep(tracker, planned)
@@ -424,7 +424,7 @@ def test_the_latest_opened_sweep_of_a_name_is_read(tracker):
     assert tracker.reader.read_sweep("heads").profile == "smoke"
 
 
-def test_an_unknown_sweep_names_those_there_are(tracker):
+def test_an_unknown_sweep_names_the_known_ones(tracker):
     open_sweep(tracker, cells("known"))
     with pytest.raises(BadInputError, match=r"no sweep 'haeds'.*heads \(laptop\)"):
         tracker.reader.read_sweep("haeds")
@@ -485,7 +485,7 @@ def test_files_are_added_to_a_run(tracker, tmp_path):
 
 
 @pytest.mark.parametrize("damage", ["cut", "missing", "swapped"])
-def test_a_finished_cell_without_its_whole_result_is_one_clear_error(tracker, damage):
+def test_a_finished_cell_without_its_complete_result_is_one_clear_error(tracker, damage):
     planned = cells(damage)
     sweep = open_sweep(tracker, planned)
     run_id = train(tracker, sweep, planned, f"{damage}-0")
@@ -563,7 +563,7 @@ def port():
     return free_port()
 
 
-def test_a_server_that_is_not_there_is_one_quick_clear_error(port):
+def test_a_server_that_does_not_exist_is_one_quick_clear_error(port):
     started = time.monotonic()
     with pytest.raises(TrackerLostError, match=rf"http://\*\*\*@127.0.0.1:{port} does not answer") as caught:
         Tracker(f"http://me:secret@127.0.0.1:{port}")

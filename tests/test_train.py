@@ -86,20 +86,20 @@ def test_a_cell_that_another_process_trains_is_left_to_it(home, tmp_path, capsys
         lock.close()
 
 
-def test_a_cell_that_fails_is_told_and_the_others_go_on(home, tmp_path, capsys):
+def test_a_cell_that_fails_is_reported_and_the_others_go_on(home, tmp_path, capsys):
     assert main([*PLAN, "--encoder.lr", "1e30", "--out", str(tmp_path)]) == EXIT_FAILED
     message = capsys.readouterr().err
     assert "failed: rec 100% e0" in message
     assert "failed: full 100% e0" in message
 
 
-def test_drives_that_are_missing_without_a_simulator_are_told(home, tmp_path, monkeypatch):
+def test_drives_that_are_missing_without_a_simulator_are_reported(home, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "study.sim.record", None)
     with pytest.raises(BadInputError, match=r"4 of 4 drives are missing.*study.data record"):
         main([*PLAN, "--recording.seed", "5", "--out", str(tmp_path)])
 
 
-def test_a_library_that_is_missing_is_told_before_the_data_is_made(home, tmp_path, monkeypatch):
+def test_a_library_that_is_missing_is_reported_before_the_data_is_made(home, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "lightning", None)
     with pytest.raises(BadInputError, match="lightning is not installed here; bring its wheel along"):
         main([*PLAN, "--frames.seed", "5", "--out", str(tmp_path)])
@@ -113,7 +113,7 @@ def test_a_library_that_is_missing_is_told_before_the_data_is_made(home, tmp_pat
         (["--out", "/dev/null/results"], "cannot write"),
     ],
 )
-def test_what_cannot_be_used_is_told(home, tmp_path, words, message):
+def test_unusable_input_is_reported(home, tmp_path, words, message):
     with pytest.raises(BadInputError, match=message):
         main([*PLAN, "--out", str(tmp_path), *words])
 
