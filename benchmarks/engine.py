@@ -28,15 +28,15 @@ from typing import Any
 
 import numpy as np
 
-from study.cell import SHARE_SECONDS, cell_flow
+from study.cell.flow import SHARE_SECONDS, cell_flow
 from study.compute.provenance import ROOT, provenance
 from study.config.files import load_profile
 from study.config.paper import LATENT
 from study.config.workspace import DATA
 from study.data.prepare import data_flow
+from study.engine.dask_engine import DaskEngine
 from study.engine.flows import run_flow
 from study.engine.local import local_engine
-from study.engine.workers import DaskEngine
 from study.results.cell_result import CellResult
 from study.stages import ENCODER, POLICY, RESULT, Batch, Flow, Task, cell_cost
 from study.sweep.plan import Plan, cell_jobs, make_plan

@@ -46,9 +46,9 @@ from study.encoder import checkpoint, training
 from study.encoder.autoencoder import MultiHeadAutoencoder
 from study.encoder.batches import plan_training
 from study.encoder.training import train_encoder
+from study.engine.dask_engine import DaskEngine
 from study.engine.flows import run_flow
 from study.engine.local import local_engine
-from study.engine.workers import DaskEngine
 from study.policy.networks import WIDTHS
 from study.policy.training import TrainedPolicies, join_policies, train_policies
 from study.stages import ENCODER, POLICY, Batch, Flow, Task

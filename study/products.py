@@ -1,10 +1,11 @@
-"""Atomic writes: whoever reads finds the whole folder or none."""
+"""Products of stages on disk: arrays, a table and facts in one folder, written atomically, with digests."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,15 +22,19 @@ Arrays = dict[str, NDArray[Any]]
 TABLE = "curves.parquet"
 
 
+@dataclass(frozen=True)
+class Product:
+    """What a training stage returns: arrays in named parts, curves, and facts as plain values."""
+
+    parts: dict[str, Arrays]
+    curves: pd.DataFrame
+    facts: dict[str, Any]
+
+
 def write_product(
-    folder: Path,
-    head_file: str,
-    head: Mapping[str, Any],
-    parts: Mapping[str, Arrays],
-    table: pd.DataFrame,
-    add: Callable[[Path], object] | None = None,
+    folder: Path, head_file: str, head: Mapping[str, Any], parts: Mapping[str, Arrays], table: pd.DataFrame
 ) -> Path:
-    """Write `folder` with `head_file`, one safetensors file for each part, the table, and what `add` writes into it."""
+    """Write a folder with the head as JSON, one safetensors file for each part, and the table."""
     with atomic_folder(folder) as draft:
         for part, arrays in parts.items():
             # Not `save_file`, whose error for a full disk is no OSError.
@@ -38,15 +43,13 @@ def write_product(
         table.to_parquet(draft / TABLE, index=False)
         digests = {file.name: _digest(file) for file in sorted(draft.iterdir())}
         (draft / head_file).write_text(json.dumps({**head, "digests": digests}, indent=1), encoding="utf-8")
-        if add:
-            add(draft)
     return folder
 
 
 def read_product(
     folder: Path, head_file: str, parts: Sequence[str]
 ) -> tuple[dict[str, Any], dict[str, Arrays], pd.DataFrame]:
-    """Return head, parts and table of what `write_product` wrote. Raises BadInputError when it is not whole."""
+    """Return head, parts and table of what `write_product` wrote. Raises BadInputError when a part is damaged."""
     files = (TABLE, *(f"{part}.safetensors" for part in parts))
     try:
         head = json.loads((folder / head_file).read_text(encoding="utf-8"))

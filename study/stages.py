@@ -5,10 +5,10 @@ A study is a graph of stages. Each is a pure function from settings and the prod
     record -> select -> render -> encoder -> latents -> policy -> result
 
 `STAGES` is the only list of them: progress words, cost estimates, keys and MLflow names derive from its records.
-`study.data` and `study.cell` say how the stages follow one another; `study.engine` runs them.
+`study.data` and `study.cell` arrange the stages in flows; `study.engine` runs them.
 
 Costs are for the reference machine (2 CPU cores at 2.5 GHz). The rates are rounded from `benchmarks/`; a running sweep
-corrects them by what it measures.
+corrects them by its own measurements.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ TEST_COST = 0.35  # an image evaluated, as a share of an image trained
 ENCODED_PER_S = 6_000.0  # images encoded, on one core
 POLICY_FRAME_S = 1 / 500_000  # a frame forward and backward through one policy, on two cores
 DRIVE_READ_S = 0.12  # a drive read again for the true state
-RESULT_S = 5.0  # a result is put together, exported and committed
+RESULT_S = 5.0  # a result is assembled, exported and committed
 
 STATE_BYTES = 32  # of one vehicle at one step in an Episode
 RESULT_BYTES = 12_000_000  # weights, curves, samples and predictions of a cell, with its share of the tracking store
@@ -53,16 +53,15 @@ class Work:
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage: its name in curves and in MLflow, what it is called while it runs, and what it counts.
+    """One stage.
 
-    `settings`: groups of settings that its product depends on, beside earlier products. `key`: the content key of the
-    product. `cost`: expected seconds.
+    `name` in curves and in MLflow; `activity` on the display; `unit` of progress; `key`: content key of the product;
+    `cost`: expected seconds.
     """
 
     name: str
     activity: str
     unit: str
-    settings: tuple[str, ...]
     key: Callable[[Work], str]
     cost: Callable[[Work], float]
 
@@ -71,13 +70,14 @@ class Stage:
 class Task:
     """One call that an engine runs somewhere: `function(*args)`.
 
-    With `reports`, the function gets a further argument `report`: call `report("progress", done, total)` or
-    `report("log", epoch, metrics)`. `weight`: the task's share of its stage, such as frames or policy seeds. With
+    A function that is slow to import is given by its name, as "module:function". With `reports`, it gets a further
+    argument `report`: call `report("progress", done, total)`, `report("log", epoch, metrics)` or
+    `report("device", name)`. `weight`: the task's share of its stage, such as frames or policy seeds. With
     `accelerated` it runs on a GPU, where the engine has any.
     """
 
     stage: Stage
-    function: Callable[..., Any]
+    function: Callable[..., Any] | str
     args: tuple[Any, ...]
     weight: int = 1
     reports: bool = False
@@ -108,10 +108,15 @@ class Cost:
     bytes: int
 
 
+def _vehicle_frames(settings: StudySettings, seconds: float) -> float:
+    """Return the states of vehicles in that many seconds of all drives."""
+    drives = settings.recording.encoder_episodes + settings.recording.policy_episodes
+    return drives * settings.town.vehicles * STEP_HZ * seconds
+
+
 def _record_seconds(work: Work) -> float:
     recording = work.settings.recording
-    steps = (recording.encoder_episodes + recording.policy_episodes) * work.settings.town.vehicles * STEP_HZ
-    return steps * (recording.warm_up + recording.duration) / VEHICLE_FRAMES_PER_S
+    return _vehicle_frames(work.settings, recording.warm_up + recording.duration) / VEHICLE_FRAMES_PER_S
 
 
 def _render_seconds(work: Work) -> float:
@@ -139,29 +144,34 @@ def _policy_seconds(work: Work) -> float:
     return work.policy_seeds * work.settings.policy.epochs * work.settings.frames.policy * POLICY_FRAME_S
 
 
-RECORD = Stage(
-    "record", "recording drives", "drive", ("town", "recording"), lambda w: recording_key(w.settings), _record_seconds
-)
-SELECT = Stage(
-    "select", "choosing frames", "drive", ("frames", "birdview"), lambda w: frames_key(w.settings), lambda _: 0.0
-)
-RENDER = Stage(
-    "render", "rendering frames", "frame", ("frames", "birdview"), lambda w: frames_key(w.settings), _render_seconds
-)
-DESCRIBE = Stage("describe", "describing the data", "card", (), RENDER.key, lambda _: 0.0)
-ENCODER = Stage(
-    "encoder", "encoder", "step", ("encoder",), lambda w: encoder_key(w.settings, w.cell, w.frames), _encoder_seconds
-)
-LATENTS = Stage("latents", "encoding", "frame", (), ENCODER.key, _latents_seconds)
-POLICY = Stage(
-    "policy",
-    "policies",
-    "epoch",
-    ("policy",),
-    lambda w: cell_key(w.settings, w.cell, w.policy_seeds, w.frames),
-    _policy_seconds,
-)
-RESULT = Stage("result", "putting the result together", "cell", (), POLICY.key, lambda _: RESULT_S)
+def _recording_key(work: Work) -> str:
+    return recording_key(work.settings)
+
+
+def _frames_key(work: Work) -> str:
+    return frames_key(work.settings)
+
+
+def _encoder_key(work: Work) -> str:
+    return encoder_key(work.settings, work.cell, work.frames)
+
+
+def _cell_key(work: Work) -> str:
+    return cell_key(work.settings, work.cell, work.policy_seeds, work.frames)
+
+
+def _no_seconds(_: Work) -> float:
+    return 0.0
+
+
+RECORD = Stage("record", "recording drives", "drive", _recording_key, _record_seconds)
+SELECT = Stage("select", "choosing frames", "drive", _frames_key, _no_seconds)
+RENDER = Stage("render", "rendering frames", "frame", _frames_key, _render_seconds)
+DESCRIBE = Stage("describe", "describing the data", "card", _frames_key, _no_seconds)
+ENCODER = Stage("encoder", "encoder", "step", _encoder_key, _encoder_seconds)
+LATENTS = Stage("latents", "encoding", "frame", _encoder_key, _latents_seconds)
+POLICY = Stage("policy", "policies", "epoch", _cell_key, _policy_seconds)
+RESULT = Stage("result", "assembling the result", "cell", _cell_key, lambda _: RESULT_S)
 
 DATA_STAGES = (RECORD, SELECT, RENDER, DESCRIBE)
 CELL_STAGES = (ENCODER, LATENTS, POLICY, RESULT)
@@ -177,9 +187,8 @@ def share_done(stages: Sequence[Stage], work: Work, stage: Stage, done: float) -
 
 def recording_cost(settings: StudySettings) -> Cost:
     """Return the cost of recording the drives."""
-    recording = settings.recording
-    steps = (recording.encoder_episodes + recording.policy_episodes) * settings.town.vehicles * STEP_HZ
-    return Cost(RECORD.cost(Work(settings)), int(steps * recording.duration * STATE_BYTES))
+    size_on_disk = _vehicle_frames(settings, settings.recording.duration) * STATE_BYTES
+    return Cost(RECORD.cost(Work(settings)), int(size_on_disk))
 
 
 def data_cost(settings: StudySettings, *, recorded: bool = True) -> Cost:
@@ -198,8 +207,8 @@ def cell_cost(settings: StudySettings, cell: Cell, policy_seeds: int) -> Cost:
 
 def total(costs: Iterable[Cost]) -> Cost:
     """Return the sum of some costs."""
-    listed = list(costs)
-    return Cost(sum(cost.seconds for cost in listed), sum(cost.bytes for cost in listed))
+    terms = list(costs)
+    return Cost(sum(cost.seconds for cost in terms), sum(cost.bytes for cost in terms))
 
 
 def clock(seconds: float) -> str:

@@ -7,8 +7,9 @@ import pandas as pd
 import pytest
 import torch
 
-from study import cell as path
-from study.cell import cell_flow, product_folders
+from study.cell import flow
+from study.cell.flow import cell_flow, product_folders
+from study.cell.job import CellJob
 from study.config.files import load_profile
 from study.config.grid import Cell
 from study.config.keys import cell_key
@@ -16,7 +17,6 @@ from study.data.frames import open_frames
 from study.engine.flows import run_flow
 from study.errors import BadInputError
 from study.results.cell_result import ARRAYS, CURVE_COLUMNS
-from study.results.job import CellJob
 
 SETTINGS = load_profile("smoke", {"encoder": {"epochs": 2, "batch": 16}, "policy": {"epochs": 5, "batch": 16}})
 REC, CEILING = Cell(heads="rec"), Cell(heads="state")
@@ -56,14 +56,15 @@ def assert_same(one, other):
 @pytest.fixture
 def many_shares(monkeypatch):
     """Make every policy seed a share of its own."""
-    monkeypatch.setattr(path, "SHARE_SECONDS", 1e-9)
+    monkeypatch.setattr(flow, "SHARE_SECONDS", 1e-9)
 
 
 def test_policies_in_shares_give_the_result_of_one_share(new_job, tmp_path, many_shares):
-    once, network, _ = run(new_job(scratch=tmp_path / "once"), one_share=True)
-    shared, again, stages = run(new_job())
-    assert len(product_folders(tmp_path / "once", once.key)) == 1
-    assert len(product_folders(tmp_path / "scratch", once.key)) == SEEDS
+    job_once, job_shared = new_job(scratch=tmp_path / "once"), new_job()
+    once, network, _ = run(job_once, one_share=True)
+    shared, again, stages = run(job_shared)
+    assert len(product_folders(job_once)) == 1
+    assert len(product_folders(job_shared)) == SEEDS
     assert stages == ["encoder", "latents", "policy", "result"]
     assert_same(once, shared)
     assert network
@@ -83,7 +84,7 @@ def test_products_of_finished_stages_are_not_made_again(new_job):
 def test_only_what_is_missing_or_damaged_is_made_again_and_is_what_it_was(new_job, many_shares):
     job = new_job()
     first, _, _ = run(job)
-    weights = sorted(product_folders(job.scratch, job.key))[1] / "weights.safetensors"
+    weights = sorted(product_folders(job))[1] / "weights.safetensors"
     content = bytearray(weights.read_bytes())
     weights.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
     steps = []

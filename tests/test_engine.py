@@ -16,10 +16,11 @@ import psutil
 import pytest
 import yaml
 
-from study.engine import local, remote, workers
+from study.engine import cluster, dask_engine, local
+from study.engine.cluster import cluster_engine, start_jobs
+from study.engine.cluster_options import check_address
 from study.engine.flows import TRIES, run_flow
 from study.engine.local import local_engine, visible_gpus
-from study.engine.remote import check_address, cluster_engine, start_jobs
 from study.errors import BadInputError
 from study.stages import ENCODER, Batch, Task
 from tests.support.listeners import run_and_record
@@ -133,7 +134,7 @@ def test_accelerated_tasks_run_where_the_gpu_is_seen(engine):
 
 def test_a_gpu_whose_worker_restarts_is_waited_for(engine, tmp_path, monkeypatch):
     """A cell that was to be trained on a GPU must not end up on the CPU."""
-    monkeypatch.setattr(workers, "SIZE", 0.0)  # notices at once that the worker is gone
+    monkeypatch.setattr(dask_engine, "SIZE", 0.0)  # notices at once that the worker is gone
     dies = flow(die, (tmp_path / "diary", 1), accelerated=True)
     waits = flow(environment, *[("CUDA_VISIBLE_DEVICES",)] * 2, accelerated=True)
     assert run_and_record(engine, {"dies": dies, "waits": waits}).products == {"dies": ["alive"], "waits": [GPU, GPU]}
@@ -195,7 +196,7 @@ def test_other_addresses_are_refused_before_anything_is_sent(address, says):
 
 
 def test_an_address_where_nobody_answers_is_one_clear_error(monkeypatch):
-    monkeypatch.setattr(remote, "CONNECT", 0.5)
+    monkeypatch.setattr(cluster, "CONNECT", 0.5)
     with pytest.raises(BadInputError, match=r"no Dask scheduler answers at t.*start one with 'dask scheduler'"):
         cluster_engine(f"tcp://127.0.0.1:{free_port()}")
 
@@ -207,7 +208,7 @@ def test_certificates_that_are_missing_are_named(tmp_path):
 
 
 def test_invalid_certificates_are_one_clear_error(tmp_path, monkeypatch):
-    monkeypatch.setattr(remote, "CONNECT", 0.5)
+    monkeypatch.setattr(cluster, "CONNECT", 0.5)
     for name in ("ca.pem", "cert.pem", "key.pem"):
         (tmp_path / name).write_text("none")
     with pytest.raises(BadInputError, match="--certificates"):

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import resource
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 
@@ -56,3 +57,35 @@ def keep_memory() -> None:
         mmap_threshold, trim_threshold = -3, -1  # names in malloc.h
         libc.mallopt(mmap_threshold, 150_000_000)
         libc.mallopt(trim_threshold, 2**31 - 1)
+
+
+def choose_device(name: str) -> str:
+    """Return the torch device for "auto" or a device's name. Raises BadInputError when this machine lacks it."""
+    if name in {"auto", "cuda"} or (name.startswith("cuda") and torch.cuda.device_count() == 1):
+        # A worker sees the one GPU that is its own, under the number 0.
+        name = "cuda:0" if torch.cuda.is_available() or name != "auto" else "cpu"
+    return str(check_device(name))
+
+
+def device_name(device: str) -> str:
+    """Return the device's name for readers."""
+    return torch.cuda.get_device_name(device) if device.startswith("cuda") else "CPU"
+
+
+def describe_determinism() -> dict[str, Any]:
+    """Return torch's flags that trade equal bits for speed, and the vector instructions it uses on a CPU."""
+    cudnn, cuda = torch.backends.cudnn, torch.backends.cuda
+    return {
+        "deterministic_algorithms": torch.are_deterministic_algorithms_enabled(),
+        "cudnn_deterministic": cudnn.deterministic,
+        "cudnn_benchmark": cudnn.benchmark,
+        "cudnn_tf32": cudnn.allow_tf32,
+        "matmul_tf32": cuda.matmul.allow_tf32,
+        "mkldnn": torch.backends.mkldnn.enabled,
+        "cpu_capability": torch.backends.cpu.get_cpu_capability(),
+    }
+
+
+def peak_bytes() -> int:
+    """Return the most memory that this process has held so far."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

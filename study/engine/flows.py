@@ -1,6 +1,6 @@
-"""Flows on an engine: each is a sequence of stages, and many of them share the engine's slots.
+"""Run flows on an engine: each is a sequence of stages, and many of them share the engine's slots.
 
-A task that fails in a way that may pass is tried again, `TRIES` times in all; its flow fails with it, the others go on.
+A task that fails for a transient reason is tried `TRIES` times; its flow fails with it, and the others go on.
 """
 
 from __future__ import annotations
@@ -23,10 +23,11 @@ WAIT = 0.5  # [s] between two looks at Ctrl-C, the display and the cluster's siz
 
 T = TypeVar("T")
 NextFlow = Callable[[], tuple[str, Flow[Any]] | None]
+Progress = Callable[[str, int, int], None]  # stage, done, total
 
 
 class FlowFailedError(RuntimeError):
-    """A stage failed for a reason that nobody expected; the text is its traceback."""
+    """A stage failed for an unexpected reason; the text is its traceback."""
 
 
 def ignore(*_: object) -> None:
@@ -35,7 +36,7 @@ def ignore(*_: object) -> None:
 
 @dataclass(frozen=True)
 class Listener:
-    """What is called when flows come along; `name` is the flow's."""
+    """Callbacks for the events of flows; `name` is the flow's."""
 
     finished: Callable[[str, Any], None]  # name, product
     failed: Callable[[str, Failure], None]  # name, why
@@ -44,53 +45,61 @@ class Listener:
     device: Callable[[str, str], None] = ignore  # name, what a task of the flow computes on
     log: Callable[[str, str, int, Mapping[str, float]], None] = ignore  # name, stage, epoch, means over its tasks
     retry: Callable[[str, str], None] = ignore  # name, why a task is tried again
-    tick: Callable[[], None] = ignore  # some time has passed
+    tick: Callable[[], None] = ignore  # at least every WAIT seconds, unless a task runs in this process
 
 
 @dataclass
 class _Running:
-    """A flow that has begun, and its present batch."""
+    """A flow that has started, and its present batch."""
 
     order: int
     name: str
     flow: Flow[Any]
     batch: Batch = field(default_factory=lambda: Batch(()))
     results: dict[int, Any] = field(default_factory=dict)
-    shares: dict[int, float] = field(default_factory=dict)  # of each task's work, done
-    total: int = 0  # as the tasks count, where they do
+    shares: dict[int, float] = field(default_factory=dict)  # task -> share of it that is done
+    total: int = 0  # in the tasks' own unit, once they have reported it
     logs: dict[int, dict[int, Mapping[str, float]]] = field(default_factory=lambda: defaultdict(dict))
 
-    def report_progress(self, listener: Listener) -> None:
+    @property
+    def stage(self) -> str:
+        return self.batch.tasks[0].stage.name
+
+    def progress(self) -> tuple[str, str, int, int]:
+        """Return name, stage, done and total."""
         weights = [task.weight for task in self.batch.tasks]
-        done = sum(weight * self.shares.get(index, 0.0) for index, weight in enumerate(weights))
-        whole = self.batch.before + sum(weights)
-        share = (self.batch.before + done) / whole
-        total = self.total or whole
-        listener.progress(self.name, self.batch.tasks[0].stage.name, math.floor(share * total + 1e-9), total)
+        done = self.batch.before + sum(weight * self.shares.get(index, 0.0) for index, weight in enumerate(weights))
+        weight = self.batch.before + sum(weights)
+        total = self.total or weight
+        return self.name, self.stage, math.floor(done / weight * total + 1e-9), total
+
+    def mean_log(self, epoch: int) -> dict[str, float]:
+        """Return the weighted means of what the tasks have logged for an epoch."""
+        logs = self.logs.pop(epoch)
+        weights = {index: self.batch.tasks[index].weight for index in logs}
+        total = sum(weights.values())
+        return {name: sum(weights[index] * logs[index][name] for index in logs) / total for name in logs[0]}
 
 
 @dataclass(frozen=True)
-class _Try:
-    """A task of a flow's present batch, and which try at it this is."""
+class _Attempt:
+    """A task of a flow's present batch, and how often it was tried with this one."""
 
     running: _Running
     index: int
-    attempt: int = 1
+    tries: int = 1
 
     @property
     def task(self) -> Task:
         return self.running.batch.tasks[self.index]
 
 
-class _Flows:
-    def __init__(
-        self, engine: Engine, next_flow: Callable[[], tuple[str, Flow[Any]] | None], listener: Listener
-    ) -> None:
+class _Runner:
+    def __init__(self, engine: Engine, next_flow: NextFlow, listener: Listener) -> None:
         self._engine, self._next_flow, self._listener = engine, next_flow, listener
-        self._ready: list[_Try] = []  # in the order in which they should run: earlier flows first
-        self._submitted: dict[int, _Try] = {}
-        self._numbers = itertools.count()
-        self._begun = 0
+        self._ready: list[_Attempt] = []  # in the order in which they should run: earlier flows first
+        self._submitted: dict[int, _Attempt] = {}
+        self._task_numbers, self._flow_numbers = itertools.count(), itertools.count()
 
     def run(self) -> None:
         while True:
@@ -98,38 +107,33 @@ class _Flows:
             if not self._submitted and not self._ready:
                 return
             for number, value in self._engine.wait(WAIT, self._hear):
-                tried = self._submitted.pop(number, None)
-                if tried is not None:  # else its flow has failed meanwhile
-                    self._end_task(tried, value)
+                if (attempt := self._submitted.pop(number, None)) is not None:  # else its flow has failed meanwhile
+                    self._end_task(attempt, value)
             check_stopped()
             self._listener.tick()
 
     def _fill(self) -> None:
-        """Submit tasks as long as the engine has room, and begin further flows when none are ready."""
-        # Where no worker has come yet, one task waits for the first: a cluster without any must not look like the end.
+        """Submit tasks as long as the engine has room, and start further flows when none are ready."""
+        # A cluster that has no worker yet gets one task, which waits for the first.
         slots, gpus = max(1, self._engine.slots()), self._engine.gpus()
         while True:
             waiting = []
-            for tried in self._ready:
-                limit = gpus if gpus and tried.task.accelerated else slots
-                same = sum(
-                    gpus == 0 or one.task.accelerated == tried.task.accelerated for one in self._submitted.values()
-                )
-                if same >= limit:
-                    waiting.append(tried)
-                    continue
-                number = next(self._numbers)
-                self._submitted[number] = tried
-                self._engine.submit(number, tried.task)
+            for attempt in self._ready:
+                accelerated = attempt.task.accelerated
+                running = sum(not gpus or each.task.accelerated == accelerated for each in self._submitted.values())
+                if running >= (gpus if gpus and accelerated else slots):
+                    waiting.append(attempt)
+                else:
+                    number = next(self._task_numbers)
+                    self._submitted[number] = attempt
+                    self._engine.submit(number, attempt.task)
             self._ready = waiting
             if waiting or len(self._submitted) >= slots + gpus or (following := self._next_flow()) is None:
                 return
-            name, flow = following
-            self._begun += 1
-            self._advance(_Running(self._begun, name, flow), None)
+            self._advance(_Running(next(self._flow_numbers), *following), None)
 
     def _advance(self, running: _Running, results: list[Any] | None) -> None:
-        """Send results into a flow, and make the tasks that it then asks for ready."""
+        """Send results into a flow, and make the tasks of its next batch ready."""
         try:
             batch = next(running.flow) if results is None else running.flow.send(results)
             while not batch.tasks:
@@ -141,77 +145,64 @@ class _Flows:
         else:
             running.batch, running.results, running.shares, running.total = batch, {}, {}, 0
             running.logs.clear()
-            running.report_progress(self._listener)
-            self._ready += [_Try(running, index) for index in range(len(batch.tasks))]
-            self._ready.sort(key=lambda tried: tried.running.order)
+            self._listener.progress(*running.progress())
+            self._ready += [_Attempt(running, index) for index in range(len(batch.tasks))]
+            self._ready.sort(key=lambda attempt: attempt.running.order)
 
-    def _end_task(self, tried: _Try, value: Any) -> None:
-        running = tried.running
+    def _end_task(self, attempt: _Attempt, value: Any) -> None:
+        running = attempt.running
         if not isinstance(value, Failure):
-            running.results[tried.index] = value
-            running.shares[tried.index] = 1.0
-            running.report_progress(self._listener)
+            running.results[attempt.index] = value
+            running.shares[attempt.index] = 1.0
+            self._listener.progress(*running.progress())
             if len(running.results) == len(running.batch.tasks):
                 self._advance(running, [running.results[index] for index in range(len(running.results))])
-        elif value.transient and not value.exhausted and tried.attempt < TRIES:
+        elif value.transient and not value.exhausted and attempt.tries < TRIES:
             self._listener.retry(running.name, value.reason)
-            self._ready.insert(0, _Try(running, tried.index, tried.attempt + 1))
+            self._ready.insert(0, _Attempt(running, attempt.index, attempt.tries + 1))
         else:
             self._ready = [other for other in self._ready if other.running is not running]
-            left = [number for number, other in self._submitted.items() if other.running is running]
-            self._engine.cancel(left)
-            for number in left:
+            unwanted = [number for number, other in self._submitted.items() if other.running is running]
+            self._engine.cancel(unwanted)
+            for number in unwanted:
                 del self._submitted[number]
             running.flow.close()
             self._listener.failed(running.name, value)
 
     def _hear(self, number: int, kind: str, *values: Any) -> None:
-        tried = self._submitted.get(number)
-        if tried is None:
+        if (attempt := self._submitted.get(number)) is None:
             return
-        running = tried.running
+        running, listener = attempt.running, self._listener
         if kind == "start":
-            self._listener.started(running.name, *values)
+            listener.started(running.name, *values)
         elif kind == "device":
-            self._listener.device(running.name, *values)
+            listener.device(running.name, *values)
         elif kind == "progress":
             done, running.total = values
-            running.shares[tried.index] = done / max(running.total, 1)
-            running.report_progress(self._listener)
+            running.shares[attempt.index] = done / max(running.total, 1)
+            listener.progress(*running.progress())
         elif kind == "log":
             epoch, metrics = values
-            running.logs[epoch][tried.index] = metrics
+            running.logs[epoch][attempt.index] = metrics
             if len(running.logs[epoch]) == len(running.batch.tasks):
-                self._log(running, epoch)
-
-    def _log(self, running: _Running, epoch: int) -> None:
-        parts = running.logs.pop(epoch)
-        weights = {index: running.batch.tasks[index].weight for index in parts}
-        whole = sum(weights.values())
-        means = {name: sum(weights[index] * parts[index][name] for index in parts) / whole for name in parts[0]}
-        self._listener.log(running.name, running.batch.tasks[0].stage.name, epoch, means)
+                listener.log(running.name, running.stage, epoch, running.mean_log(epoch))
 
 
 def run_flows(engine: Engine, next_flow: NextFlow, listener: Listener) -> None:
     """Run flows until `next_flow` has no more and all have ended. `next_flow` is asked whenever the engine has room."""
-    _Flows(engine, next_flow, listener).run()
+    _Runner(engine, next_flow, listener).run()
 
 
-Progress = Callable[[str, int, int], None]
-
-
-def run_flow(flow: Flow[T], engine: Engine | None = None, progress: Progress | None = None) -> T:
+def run_flow(flow: Flow[T], engine: Engine | None = None, progress: Progress = ignore) -> T:
     """Run one flow, in this process unless an engine is given, and return its product.
 
-    `progress(stage, done, total)`. Raises BadInputError for a failure with a clear reason, FlowFailedError for others.
+    Raises BadInputError for a failure with a clear reason, FlowFailedError for others.
     """
-    only = iter([("", flow)])
-    products: list[T] = []
+    flows, products = iter([("", flow)]), list[T]()
 
     def fail(_: str, failure: Failure) -> None:
         raise BadInputError(failure.reason) if failure.expected else FlowFailedError(failure.reason)
 
-    tell = progress or ignore
-    listener = Listener(lambda _, product: products.append(product), fail, lambda _, *how: tell(*how))
-    run_flows(engine or InlineEngine(), lambda: next(only, None), listener)
+    listener = Listener(lambda _, product: products.append(product), fail, lambda _, *step: progress(*step))
+    run_flows(engine or InlineEngine(), lambda: next(flows, None), listener)
     return products[0]

@@ -1,4 +1,4 @@
-"""The engine without processes: tasks run one after the other, in this one."""
+"""The engine without processes: tasks run one after the other in this one."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from study.stages import Task
 
 
 class InlineEngine:
-    """Runs tasks where `wait` is called. Needs no Dask; for tests, and for machines with one GPU."""
+    """Runs tasks where `wait` is called, without Dask: for tests, and for machines with one GPU. See `Engine`."""
 
     def __init__(self) -> None:
         self._waiting: deque[tuple[int, Task]] = deque()
@@ -28,18 +28,18 @@ class InlineEngine:
         return 1
 
     def gpus(self) -> int:
-        """Return 0: every task runs alone, on whatever device it finds."""
+        """Return 0: a task finds its GPU itself."""
         return 0
 
     def submit(self, number: int, task: Task) -> None:
-        """Take the task; `wait` runs it."""
+        """Queue the task; `wait` runs it."""
         self._waiting.append((number, task))
 
     def cancel(self, numbers: Collection[int]) -> None:
-        """Forget tasks that have not started."""
+        """Drop queued tasks."""
         self._waiting = deque(entry for entry in self._waiting if entry[0] not in numbers)
 
-    def wait(self, seconds: float, hear: Hear) -> list[tuple[int, Any]]:  # noqa: ARG002 - a task takes what it takes
+    def wait(self, seconds: float, hear: Hear) -> list[tuple[int, Any]]:  # noqa: ARG002 - a task cannot be interrupted
         """Run the next task to its end."""
         if not self._waiting:
             return []

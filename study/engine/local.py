@@ -6,18 +6,12 @@ import logging
 import os
 import signal
 from collections.abc import Sequence
-from functools import partial
 from multiprocessing import resource_tracker
 from pathlib import Path
 
-from distributed import (
-    Client,
-    Nanny,
-    Scheduler,
-    SpecCluster,
-)
+from distributed import Client, Nanny, Scheduler, SpecCluster
 
-from study.engine.workers import GPU, DaskEngine, close_cluster, configure_dask
+from study.engine.dask_engine import GPU, DaskEngine, configure_dask
 
 GPU_DRIVERS = ("/dev/nvidiactl", "/dev/kfd", "/dev/dxg")  # of CUDA, ROCm, and either in WSL
 
@@ -39,13 +33,13 @@ def local_engine(workers: int, scratch: Path, gpus: Sequence[str] = ()) -> DaskE
         "dashboard": False,
         "silence_logs": logging.CRITICAL,
     }
-    # Only workers with a GPU may see it: what computes on a CPU must not open one by chance.
+    # Only a worker with a GPU may see it: tasks for a CPU must not open one by chance.
     kinds = [{"resources": {GPU: 1}, "env": {"CUDA_VISIBLE_DEVICES": name}} for name in gpus]
     kinds += [{"env": {"CUDA_VISIBLE_DEVICES": ""}} if gpus else {} for _ in range(workers)]
     address = {"host": "127.0.0.1", "port": 0, "dashboard": False, "dashboard_address": "127.0.0.1:0"}
-    resource_tracker.ensure_running()  # its start would lift the mask again
-    # Ctrl-C reaches every process of a terminal, and is this one's to answer. The threads that are born here never see
-    # it, nor do the workers that they start, from their first moment on.
+    resource_tracker.ensure_running()  # starting it later would unblock the signal
+    # A terminal sends Ctrl-C to every process, and this process alone handles it. Threads that start here inherit the
+    # blocked signal, and so do the workers.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         cluster = SpecCluster(
@@ -56,18 +50,18 @@ def local_engine(workers: int, scratch: Path, gpus: Sequence[str] = ()) -> DaskE
         client = Client(cluster, timeout=60)
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-    return DaskEngine(client, partial(close_cluster, client, cluster), cluster.scheduler_address)
+    return DaskEngine(client, cluster.scheduler_address, cluster)
 
 
 def visible_gpus(device: str) -> list[str]:
     """Return CUDA's names of the GPUs that `--device` asks for: all of them for auto and cuda, one for cuda:N."""
     if device == "cpu" or (device == "auto" and not any(Path(file).exists() for file in GPU_DRIVERS)):
         return []
-    import torch  # noqa: PLC0415 - seconds of work that a CPU run does not need
+    import torch  # noqa: PLC0415 - takes seconds that a CPU run can do without
 
     names = os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")
     count = torch.cuda.device_count()
-    listed = names[:count] if len(names) >= count and names != [""] else [str(number) for number in range(count)]
+    visible = names[:count] if len(names) >= count and names != [""] else [str(number) for number in range(count)]
     if device.startswith("cuda:"):
-        return listed[int(device.removeprefix("cuda:")) :][:1]
-    return listed
+        return visible[int(device.removeprefix("cuda:")) :][:1]
+    return visible

@@ -1,8 +1,9 @@
-"""One task, wherever it runs: what it reports, and which failures another try may mend."""
+"""Run one task on any engine; tell transient failures from permanent ones."""
 
 from __future__ import annotations
 
 import os
+import pkgutil
 import platform
 import traceback
 from collections.abc import Callable, Collection
@@ -13,7 +14,7 @@ from typing import Any, Protocol
 from study.errors import WRITE_ERRORS, BadInputError, TrainingDivergedError, cannot_write
 from study.stages import Task
 
-NO_MEMORY = ("out of memory", "can't allocate memory")  # torch says so in RuntimeErrors, GPUs and CPUs each
+NO_MEMORY = ("out of memory", "can't allocate memory")  # in torch's RuntimeErrors of GPUs and CPUs
 
 Hear = Callable[..., None]  # hear(number of the task, kind of event, *values)
 
@@ -22,8 +23,8 @@ Hear = Callable[..., None]  # hear(number of the task, kind of event, *values)
 class Failure:
     """Why a task failed.
 
-    `transient`: another try may succeed; `exhausted`: the engine has tried often enough for now; `expected`: the reason
-    is one clear message.
+    `transient`: another try may succeed; `exhausted`: the engine has tried often enough; `expected`: the reason is one
+    clear message, else a traceback.
     """
 
     reason: str
@@ -33,24 +34,24 @@ class Failure:
 
 
 class Engine(Protocol):
-    """What runs tasks. Use it as a context; leaving it on Ctrl-C does not wait for what still runs."""
+    """What runs tasks. Use it as a context; leaving it on Ctrl-C does not wait for running tasks."""
 
     def slots(self) -> int:
-        """Return how many tasks can run at a time, just now."""
+        """Return how many tasks can run at a time at this moment."""
 
     def gpus(self) -> int:
-        """Return how many accelerated tasks can run at a time, just now; 0: they run like any other."""
+        """Return how many accelerated tasks can run at a time; 0: they run like any other."""
 
     def submit(self, number: int, task: Task) -> None:
-        """Run the task, soon, under a number of the caller's."""
+        """Queue the task under a number that the caller chooses."""
 
     def cancel(self, numbers: Collection[int]) -> None:
-        """Give up tasks whose results are not needed any more, where that is possible."""
+        """Give up tasks whose results are not needed, where that is possible."""
 
     def wait(self, seconds: float, hear: Hear) -> list[tuple[int, Any]]:
-        """Return the number and the value, or Failure, of each task that has ended since; wait for one this long.
+        """Wait up to `seconds` for tasks to end, and return the number and the value, or Failure, of each.
 
-        Meanwhile, `hear` is called with what running tasks report.
+        Meanwhile, call `hear` with what running tasks report.
         """
 
 
@@ -58,18 +59,18 @@ def perform(task: Task, report: Callable[..., None]) -> Any:
     """Run a task in this process and return its value, or a Failure."""
     report("start", platform.node(), os.getpid())
     try:
-        return task.function(*task.args, *([report] if task.reports else []))
-    except Exception as error:  # noqa: BLE001 - whatever it is belongs to this task, and the others go on
+        function = pkgutil.resolve_name(task.function) if isinstance(task.function, str) else task.function
+        return function(*task.args, *([report] if task.reports else []))
+    except Exception as error:  # noqa: BLE001 - any error is this task's, and the others go on
         return failure_of(error)
 
 
 def failure_of(error: Exception) -> Failure:
-    """Return what an exception means: whether another try may succeed, and the reason, a traceback where need be."""
+    """Return what an exception means: whether another try may succeed, and the reason."""
     if isinstance(error, BadInputError | TrainingDivergedError):
         return Failure(str(error), transient=False)
     if isinstance(error, OSError) and error.errno in WRITE_ERRORS:
         return Failure(cannot_write(Path(error.filename or "a file"), error), transient=True)
-    transient = isinstance(error, OSError | MemoryError) or (
-        isinstance(error, RuntimeError) and any(words in str(error).lower() for words in NO_MEMORY)
-    )
+    no_memory = isinstance(error, RuntimeError) and any(words in str(error).lower() for words in NO_MEMORY)
+    transient = isinstance(error, OSError | MemoryError) or no_memory
     return Failure("".join(traceback.format_exception(error)), transient, expected=False)

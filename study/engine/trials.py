@@ -1,7 +1,7 @@
-"""Which cell next: Optuna decides, by its public `ask` and `tell`, in the one process that runs the sweep.
+"""Let Optuna decide which cell runs next, by its public `ask` and `tell`, in the one process that runs the sweep.
 
-A trial is one run of a cell; its only parameter is the cell's label with its key, as one string. Optuna is never the
-truth about what is done: MLflow is. So whatever an earlier process left open is closed at the start.
+A trial is one run of a cell; its only parameter is the cell's label with its key, as one string. MLflow, not Optuna,
+knows what is done, so trials that an earlier process left open are closed at the start.
 """
 
 from __future__ import annotations
@@ -27,21 +27,20 @@ class Trials:
         """Queue the cells of these keys in this order. Raises BadInputError when the file cannot be used."""
         optuna.logging.set_verbosity(optuna.logging.ERROR)
         self._file = file
-        self._words = {key: f"{label} {key}" for key, label in labels.items()}
-        self._trials: dict[str, Trial] = {}
+        self._names = {key: f"{label} {key}" for key, label in labels.items()}
+        self._running: dict[str, Trial] = {}
+        self._queued = list(order)
         with self._guard():
             file.parent.mkdir(parents=True, exist_ok=True)
             self._study = optuna.create_study(
                 study_name=study, storage=f"sqlite:///{file}", direction="maximize", load_if_exists=True
             )
-            self._close_left()
-            keys = list(order)
-            for key in keys:
-                self._study.enqueue_trial({PARAMETER: self._words[key]})
-        self._left = len(keys)
+            self._close_open()
+            for key in self._queued:
+                self._study.enqueue_trial({PARAMETER: self._names[key]})
 
-    def _close_left(self) -> None:
-        """Close what an earlier process has left open."""
+    def _close_open(self) -> None:
+        """Close the trials that are open."""
         for trial in self._study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
             self._study.tell(trial.number, state=TrialState.FAIL)
         for _ in self._study.get_trials(deepcopy=False, states=(TrialState.WAITING,)):
@@ -49,32 +48,32 @@ class Trials:
 
     def ask(self) -> str | None:
         """Return the key of the cell to run next, or None when there is none."""
-        if not self._left:
-            return None  # Optuna would make one up
-        self._left -= 1
+        if not self._queued:
+            return None  # Optuna would invent one
         with self._guard():
             trial = self._study.ask()
-            word = trial.suggest_categorical(PARAMETER, list(self._words.values()))
-        key = next(key for key, each in self._words.items() if each == word)
-        self._trials[key] = trial
+            name = trial.suggest_categorical(PARAMETER, list(self._names.values()))
+        key = next(key for key in self._queued if self._names[key] == name)
+        self._queued.remove(key)
+        self._running[key] = trial
         return key
 
     def finish(self, key: str, score: float) -> None:
-        """Tell that a cell is finished; the score is for those who look at Optuna's dashboard."""
+        """Record that a cell is finished, with a score for Optuna's dashboard."""
         with self._guard():
-            self._study.tell(self._trials.pop(key), score)
+            self._study.tell(self._running.pop(key), score)
 
     def fail(self, key: str, reason: str) -> None:
-        """Tell that a cell has failed."""
+        """Record that a cell has failed."""
         with self._guard():
-            trial = self._trials.pop(key)
+            trial = self._running.pop(key)
             trial.set_user_attr("reason", masked(reason)[:2000])
             self._study.tell(trial, state=TrialState.FAIL)
 
     def stop(self) -> None:
-        """Close what is open: the sweep was stopped."""
+        """Close the trials that are open: the sweep was stopped."""
         with self._guard():
-            self._close_left()
+            self._close_open()
 
     @contextmanager
     def _guard(self) -> Iterator[None]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -54,8 +54,8 @@ class CellResult:
     predictions: Arrays
     facts: dict[str, Any]
 
-    def save(self, folder: Path, add: Callable[[Path], object] | None = None) -> Path:
-        """Write the result as `folder`, whole or not at all, with what `add` writes into it."""
+    def save(self, folder: Path) -> Path:
+        """Write the result as `folder`, atomically."""
         head = {
             "format_version": FORMAT_VERSION,
             "cell": self.cell.model_dump(mode="json"),
@@ -63,7 +63,7 @@ class CellResult:
             "settings": self.settings,
             "facts": self.facts,
         }
-        return write_product(folder, HEAD, head, {part: getattr(self, part) for part in ARRAYS}, self.curves, add)
+        return write_product(folder, HEAD, head, {part: getattr(self, part) for part in ARRAYS}, self.curves)
 
     @staticmethod
     def load(folder: Path) -> CellResult:

@@ -13,7 +13,7 @@ from typing import Any, ParamSpec, Self, TypeVar
 
 from tenacity import RetryCallState, Retrying, retry_if_exception_type, stop_after_delay, wait_fixed
 
-from study.cell import cell_flow, product_folders
+from study.cell.flow import cell_flow, product_folders
 from study.console.display import Display
 from study.console.interrupts import check_stopped
 from study.engine.flows import Listener
@@ -103,7 +103,7 @@ class Committing:
         run = self._runs.pop(name)
         self._patiently(self._tracker.commit, run, result, network)
         self._trials.finish(name, _score(result))
-        for folder in product_folders(self._jobs[name].scratch, name):
+        for folder in product_folders(self._jobs[name]):
             shutil.rmtree(folder, ignore_errors=True)
         self._display.finish(name)
 

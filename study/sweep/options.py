@@ -15,6 +15,7 @@ from study.console.options import (
     add_options,
     add_tracking_option,
 )
+from study.engine.cluster_options import check_cluster
 from study.errors import BadInputError
 
 
@@ -87,8 +88,6 @@ def check_run_options(options: argparse.Namespace) -> None:
     if options.certificates and not (options.cluster or "").startswith("tls://"):
         raise BadInputError("--certificates goes with --cluster tls://host:port")
     if options.cluster:
-        from study.engine.remote import check_cluster  # noqa: PLC0415 - Dask, which only a run needs
-
         check_cluster(options.cluster, options.certificates)
     if options.threads < 1 or (options.device not in {"auto", "cpu"} and not options.cluster):
         check_machine(options)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from study.cell.job import CellJob
 from study.config.files import load_grid, load_profile, merge
 from study.config.grid import Cell, Grid
 from study.config.keys import cell_key, content_key, frames_key
@@ -21,7 +22,6 @@ from study.console.options import (
 )
 from study.data.prepare import drives_folder, frames_folder
 from study.episode.imported import Imported, open_import
-from study.results.job import CellJob
 from study.stages import Cost, Work, data_cost
 
 if TYPE_CHECKING:

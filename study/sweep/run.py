@@ -21,12 +21,12 @@ from study.console.display import Display
 from study.data.card import card_files, source_drives
 from study.data.frames import open_frames
 from study.data.prepare import data_flow, describe_data
+from study.engine.cluster import cluster_engine
+from study.engine.dask_engine import DaskEngine
 from study.engine.flows import run_flow, run_flows
 from study.engine.inline import InlineEngine
 from study.engine.local import local_engine, visible_gpus
-from study.engine.remote import cluster_engine
 from study.engine.tasks import Engine
-from study.engine.workers import DaskEngine
 from study.errors import EXIT_FAILED, BadInputError, masked
 from study.stages import DESCRIBE, Batch, Flow, Task, cell_cost
 from study.sweep.committing import Committing, store_folder

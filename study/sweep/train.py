@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING
 
 from filelock import FileLock, Timeout
 
+from study.cell.job import CellJob
 from study.compute.provenance import cores
 from study.config.workspace import DATA
 from study.console.display import Display
@@ -34,13 +35,12 @@ from study.engine.inline import InlineEngine
 from study.engine.tasks import Failure
 from study.errors import EXIT_AGAIN, EXIT_FAILED, BadInputError
 from study.results.cell_result import CellResult
-from study.results.job import CellJob
 from study.stages import Flow, cell_cost
 from study.sweep.options import add_machine_options, add_plan_options, check_machine
 from study.sweep.plan import Plan, cell_jobs, given_plan
 
 if TYPE_CHECKING:  # Dask, which may be missing
-    from study.engine.workers import DaskEngine
+    from study.engine.dask_engine import DaskEngine
 
 
 def parser() -> Parser:
@@ -90,7 +90,7 @@ def train(plan: Plan, out: Path, options: argparse.Namespace) -> int:
     if not jobs:
         return 0
     _check_installed()
-    from study.cell import cell_flow, product_folders  # noqa: PLC0415 - what it computes with may be missing
+    from study.cell.flow import cell_flow, product_folders  # noqa: PLC0415 - what it computes with may be missing
 
     DATA.mkdir(exist_ok=True)
     title = f"{plan.grid.name} ({plan.profile})"
@@ -136,7 +136,7 @@ class _Saving:
         jobs: dict[str, CellJob],
         display: Display,
         flow: Callable[[CellJob], Flow[tuple[CellResult, bytes]]],
-        kept: Callable[[Path, str], list[Path]],
+        kept: Callable[[CellJob], list[Path]],
     ) -> None:
         self._out, self._jobs, self._display, self._flow, self._kept = out, jobs, display, flow, kept
         self._left = list(jobs)
@@ -160,7 +160,7 @@ class _Saving:
     def finished(self, name: str, value: tuple[CellResult, bytes]) -> None:
         """Save the result."""
         value[0].save(self._out / name)
-        for folder in self._kept(self._jobs[name].scratch, name):
+        for folder in self._kept(self._jobs[name]):
             shutil.rmtree(folder, ignore_errors=True)
         self._display.finish(name)
         self._locks.pop(name).release()

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from study.cell.job import CellJob
 from study.compute.provenance import cores
 from study.config.grid import Cell
 from study.config.keys import cell_key
@@ -31,7 +32,6 @@ from study.data.prepare import data_flow
 from study.engine.flows import run_flow
 from study.errors import BadInputError, one_of
 from study.results.cell_result import ARRAYS, CURVE_COLUMNS, CellResult
-from study.results.job import CellJob
 from study.stages import cell_cost
 from study.sweep.options import add_plan_options
 from study.sweep.plan import Plan, given_plan, look_up
@@ -143,7 +143,7 @@ def compute_again(plan: Plan, recorded: CellResult, display: Display) -> CellRes
     # Finding nothing to verify needs none of these.
     import torch  # noqa: PLC0415
 
-    from study.cell import cell_flow  # noqa: PLC0415
+    from study.cell.flow import cell_flow  # noqa: PLC0415
     from study.engine.local import local_engine  # noqa: PLC0415
 
     own = {name: value for name, value in recorded.settings.items() if name in StudySettings.model_fields}

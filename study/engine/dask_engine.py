@@ -1,7 +1,7 @@
-"""Engines of Dask distributed, which supervises every process of a study: this machine's cores, or a cluster.
+"""The engine of Dask distributed, which supervises every process of a study.
 
-Worker processes that die are restarted, and their tasks run again elsewhere. Each task computes in one thread of one
-worker, so results do not depend on how many workers there are. Workers exit when this process does.
+Workers that die are restarted, and their tasks run again. Each task computes in one thread of one worker, so results do
+not depend on how many workers there are. Workers exit when this process does.
 """
 
 from __future__ import annotations
@@ -21,13 +21,7 @@ from typing import Any, Self
 
 import cloudpickle  # comes with dask
 import dask
-from distributed import (
-    CancelledError,
-    Client,
-    Future,
-    KilledWorker,
-    get_worker,
-)
+from distributed import CancelledError, Client, Future, KilledWorker, get_worker
 
 from study.console.interrupts import check_stopped
 from study.engine.flows import TRIES, WAIT
@@ -48,41 +42,45 @@ CONFIGURATION = {
     "distributed.worker.memory.terminate": False,
     "distributed.worker.profile.enabled": False,
     "distributed.admin.large-graph-warning-threshold": "1GB",  # latents travel as arguments
-    "distributed.admin.tick.limit": "1h",  # a busy machine is no news
+    "distributed.admin.tick.limit": "1h",  # a busy machine is no reason to warn
 }
 
 
 class EngineLostError(BadInputError):
-    """The scheduler is gone; once there is one again, the same command continues."""
+    """The scheduler is gone; once there is one again, the same command resumes."""
 
 
 class DaskEngine:
-    """Runs tasks on the workers of a Dask scheduler."""
+    """Runs tasks on the workers of a Dask scheduler. See `Engine`."""
 
     def __init__(
-        self, client: Client, close: Callable[[], None], address: str, renew: Callable[[], object] | None = None
+        self, client: Client, address: str, cluster: Any = None, renew: Callable[[], object] | None = None
     ) -> None:
-        """Take a connected client; `close` ends what was started for it, `renew` replaces workers that were lost."""
-        self._client, self._close, self._address, self._renew = client, close, address, renew
+        """Take a connected client, and the cluster that was started for it; `renew` replaces workers that were lost."""
+        self._client, self._address, self._cluster, self._renew = client, address, cluster, renew
         self._topic = f"study-{uuid.uuid4().hex}"
         self._futures: dict[int, Future[Any]] = {}
         self._messages: SimpleQueue[tuple[str, int, Any]] = SimpleQueue()
         self._looked, self._slots, self._gpus = 0.0, 0, 0
         self._clock = time.time() - time.monotonic()
-        client.subscribe_topic(self._topic, self._take)
+        client.subscribe_topic(self._topic, self._take_event)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is None:  # else the process is about to exit, and its workers with it: closing would wait for them
-            self._close()
+            with suppress(OSError, TimeoutError):
+                self._client.close()
+                if self._cluster is not None:
+                    self._cluster.close()
 
-    def _take(self, event: tuple[float, tuple[int, tuple[Any, ...]]]) -> None:
+    def _take_event(self, event: tuple[float, tuple[int, tuple[Any, ...]]]) -> None:
         number, values = event[1]
         self._messages.put(("event", number, values))
 
     def _look(self) -> None:
+        """Count the workers, every SIZE seconds."""
         if time.monotonic() - self._looked > SIZE or not self._slots:
             with self._lost():
                 workers = self._client.scheduler_info(n_workers=-1).get("workers")
@@ -91,7 +89,7 @@ class DaskEngine:
             workers = workers.values()
             # Never fewer than there were: while a GPU's worker restarts, its tasks must not go to a CPU.
             self._gpus = max(self._gpus, int(sum(worker["resources"].get(GPU, 0) for worker in workers)))
-            # A worker with a GPU trains there, and leaves the rest to the others where there are any.
+            # Workers with a GPU train there, and leave the other tasks to workers without, if there are any.
             plain = sum(worker["nthreads"] for worker in workers if not worker["resources"].get(GPU))
             self._slots = plain or sum(worker["nthreads"] for worker in workers)
             self._looked = time.monotonic()
@@ -99,7 +97,7 @@ class DaskEngine:
                 self._renew()
 
     def slots(self) -> int:
-        """Return how many tasks can run at a time, just now; 1 while the cluster has no worker, which waits for it."""
+        """Return how many tasks can run at a time at this moment; 1 while there is no worker yet."""
         self._look()
         return max(1, self._slots)
 
@@ -109,16 +107,15 @@ class DaskEngine:
         return self._gpus
 
     def workers_see(self, file: Path) -> bool:
-        """Wait for a worker, and return whether all there are see this file under this path, as in a shared folder."""
-        said = False
+        """Wait for a worker, and return whether all workers find this file under this path, as in a shared folder."""
+        self._look()
+        if not self._slots:
+            print(f"waiting for a worker to come to the scheduler at {self._address}", file=sys.stderr, flush=True)
         while not self._slots:
-            self._look()
-            if not self._slots and not said:
-                print(f"waiting for a worker to come to the scheduler at {self._address}", file=sys.stderr, flush=True)
-                said = True
-            time.sleep(0 if self._slots else WAIT)
+            time.sleep(WAIT)
             check_stopped()
-        name = str(file)  # a lambda travels by value: workers may lack this program, which the first task says
+            self._look()
+        name = str(file)  # a lambda travels by value: workers may lack this program, which the first task tells
         with self._lost():
             seen = self._client.run(lambda: os.path.isfile(name))  # noqa: PTH113
         return bool(seen) and all(seen.values())
@@ -138,12 +135,12 @@ class DaskEngine:
         future.add_done_callback(lambda _: self._messages.put(("end", number, None)))
 
     def cancel(self, numbers: Collection[int]) -> None:
-        """Forget tasks: those that wait are dropped, those that run end when they next report."""
+        """Forget tasks: queued ones are dropped, running ones end at their next report."""
         for number in numbers:
             self._futures.pop(number, None)  # Dask releases what nobody holds
 
     def wait(self, seconds: float, hear: Hear) -> list[tuple[int, Any]]:
-        """Return what has ended since; see `Engine`. Raises EngineLostError when the scheduler is gone."""
+        """Return the tasks that have ended; see `Engine`. Raises EngineLostError when the scheduler is gone."""
         self._check_clock()
         ended: list[tuple[int, Any]] = []
         deadline = time.monotonic() + seconds
@@ -156,7 +153,7 @@ class DaskEngine:
                 hear(number, *values)
             elif (future := self._futures.pop(number, None)) is not None:
                 ended.append((number, self._value(future)))
-        if self._client.status != "running":  # what ran is lost to it, even if it connects again
+        if self._client.status != "running":  # its tasks are lost, even if it connects again
             raise self._gone()
         return ended
 
@@ -177,11 +174,10 @@ class DaskEngine:
             return Failure(reason, transient=True, exhausted=True)
         except CancelledError:
             raise self._gone() from None
-        except Exception as error:  # noqa: BLE001 - what kept the task from running at all, such as a missing package
-            step = (
-                "; install this program and requirements.lock on every worker" if isinstance(error, ImportError) else ""
-            )
-            return Failure(f"{type(error).__name__}: {error}{step}", transient=False)
+        except Exception as error:  # noqa: BLE001 - the task could not even start, for want of a package or so
+            step = "; install this program and requirements.lock on every worker"
+            text = f"{type(error).__name__}: {error}{step if isinstance(error, ImportError) else ''}"
+            return Failure(text, transient=False)
 
     @contextmanager
     def _lost(self) -> Iterator[None]:
@@ -198,11 +194,11 @@ class DaskEngine:
 
 
 class _UnwantedError(RuntimeError):
-    """Nobody waits for this task any more: its flow has failed, or its client or scheduler is gone."""
+    """Nobody waits for this task: its flow has failed, or its client or scheduler is gone."""
 
 
-# A lambda travels by value: the scheduler needs none of this program, and a worker that lacks a part of it says so in
-# the task's failure. A task that Dask itself unpacked there would end the worker, and its flow would wait for ever.
+# A lambda travels by value: the scheduler needs none of this program, and a worker that lacks a part of it fails the
+# task. If Dask itself unpacked the task there, that would end the worker, and the flow would wait for ever.
 _UNPACKED = lambda packed: pickle.loads(packed)()  # noqa: E731, S301
 
 
@@ -211,21 +207,13 @@ def _run_on_worker(topic: str, number: int, task: Task) -> Any:
     key = worker.get_current_task()
 
     def report(*values: Any) -> None:
-        # Dask cannot stop a thread. Ended here, the task leaves the worker free for those who still want something.
+        # Dask cannot stop a thread. A task that nobody wants ends itself here, and frees the worker.
         state = worker.state.tasks.get(key)
         if state is None or state.state == "cancelled":
             raise _UnwantedError
         worker.log_event(topic, (number, values))
 
     return perform(task, report)
-
-
-def close_cluster(client: Client, cluster: Any = None) -> None:
-    """Close a client, and the cluster that was started for it."""
-    with suppress(OSError, TimeoutError):
-        client.close()
-        if cluster is not None:
-            cluster.close()
 
 
 def configure_dask() -> None:

@@ -1,0 +1,1 @@
+"""The main path of one cell and the stages on it."""

@@ -1,0 +1,72 @@
+"""The main path of one cell: a trained encoder, its latents, the policies on them, one CellResult.
+
+Products of finished stages are kept under the job's `scratch` by key, so that a killed sweep resumes. Tasks name the
+functions of `study.cell.stages`, since the process that only plans and commits does not load torch.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from study.cell.job import CellJob
+from study.config.heads import CEILING
+from study.errors import BadInputError
+from study.products import Product, read_product, write_product
+from study.results.cell_result import CellResult
+from study.stages import ENCODER, LATENTS, POLICY, RESULT, Batch, Flow, Task
+
+SHARE_SECONDS = 40.0  # on one core of the reference machine, of a share of the policies: what a kill costs at most
+HEAD = "product.json"
+
+
+def cell_flow(job: CellJob, *, one_share: bool = False) -> Flow[tuple[CellResult, bytes]]:
+    """Train the cell's encoder, encode the policy set, train its policies in shares, and assemble the result.
+
+    The ceiling has no encoder: its latents are the true state. With `one_share` all policies are trained at once,
+    which is fastest on a GPU. Returns the result and its network, an archive of torch.export, empty for the ceiling.
+    """
+    encoder = None
+    if job.cell.heads != CEILING:
+        folder = job.products / f"encoder-{ENCODER.key(job.work)}"
+        task = Task(ENCODER, "study.cell.stages:train_cell_encoder", (job,), reports=True, accelerated=True)
+        (encoder,) = yield from _keep([folder], ("weights", "samples"), [task])
+    (latents,) = yield Batch(
+        [Task(LATENTS, "study.cell.stages:encode_policy_set", (job, encoder), reports=True, accelerated=True)]
+    )
+    share_count = 1 if one_share else min(job.policy_seeds, math.ceil(2 * POLICY.cost(job.work) / SHARE_SECONDS))
+    shares = [share.tolist() for share in np.array_split(np.arange(job.policy_seeds), share_count)]
+    train = "study.cell.stages:train_policy_share"
+    policies = yield from _keep(
+        [job.products / f"policies-{job.key}-{seeds[0]}-{seeds[-1]}" for seeds in shares],
+        ("weights", "predictions"),
+        [Task(POLICY, train, (job, latents, seeds), len(seeds), reports=True, accelerated=True) for seeds in shares],
+    )
+    result: tuple[CellResult, bytes]
+    (result,) = yield Batch([Task(RESULT, "study.cell.stages:assemble_result", (job, encoder, latents, policies))])
+    return result
+
+
+def product_folders(job: CellJob) -> list[Path]:
+    """Return the kept policies of a cell: nobody needs them once the cell is committed."""
+    return list(job.products.glob(f"policies-{job.key}-*"))
+
+
+def _keep(folders: list[Path], parts: tuple[str, ...], tasks: list[Task]) -> Generator[Batch, list[Any], list[Product]]:
+    """Return the products in these folders; the tasks make those that are missing or damaged, and these are kept."""
+    products: dict[Path, Product] = {}
+    for folder in folders:
+        with suppress(BadInputError):
+            head, arrays, curves = read_product(folder, HEAD, parts)
+            products[folder] = Product(arrays, curves, head["facts"])
+    missing = {folder: task for folder, task in zip(folders, tasks, strict=True) if folder not in products}
+    before = sum(task.weight for folder, task in zip(folders, tasks, strict=True) if folder in products)
+    for folder, product in zip(missing, (yield Batch(list(missing.values()), before)), strict=True):
+        write_product(folder, HEAD, {"facts": product.facts}, product.parts, product.curves)
+        products[folder] = product
+    return [products[folder] for folder in folders]

@@ -1,0 +1,192 @@
+"""The stages of a cell: functions that an engine runs on a worker. None of them knows a tracker."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from numpy.typing import NDArray
+
+from study.cell.job import CellJob
+from study.compute.device import choose_device, describe_determinism, device_name, peak_bytes
+from study.compute.provenance import provenance
+from study.config.heads import load_heads
+from study.config.keys import cell_key
+from study.data.frames import FrameStore, open_frames
+from study.data.prepare import data_flow
+from study.data.true_state import true_state
+from study.driving.driver import export_driver
+from study.encoder.latents import encode
+from study.encoder.training import train_encoder
+from study.engine.flows import run_flow
+from study.errors import BadInputError
+from study.policy.training import TrainedPolicies, join_policies, train_policies
+from study.products import Arrays, Product
+from study.results.cell_result import NO_SEED, CellResult
+from study.stages import ENCODER
+
+PROBED = ("speed", "light", "lead_gap")  # columns of the labels that reports probe the latents for
+ENCODER_CURVES = ["split", "epoch", "metric", "value"]  # columns
+
+Report = Callable[..., None]  # see `Task`
+
+
+@dataclass(frozen=True)
+class Latents:
+    """The policy set as policies see it: z [N, 64] float32 and labels of both splits, and the stage's facts."""
+
+    z_train: NDArray[np.float32]
+    z_test: NDArray[np.float32]
+    labels_train: pd.DataFrame
+    labels_test: pd.DataFrame
+    facts: dict[str, Any]
+
+
+def train_cell_encoder(job: CellJob, report: Report) -> Product:
+    """Train the encoder. Raises BadInputError for settings that cannot be met, TrainingDivergedError for a bad loss."""
+    store, device, facts = _begin(job, report)
+    settings, cell = job.settings, job.cell
+    trained = train_encoder(
+        store.encoder,
+        cell.heads,
+        cell.fraction,
+        cell.encoder_seed,
+        settings.encoder,
+        settings.frames,
+        device=device,
+        checkpoint=job.scratch / "encoders" / ENCODER.key(job.work),
+        log=partial(report, "log"),
+        progress=partial(report, "progress"),
+    )
+    facts |= {"frames": trained.frames, "precision": trained.precision}
+    facts |= {"seconds": trained.seconds, "peak_bytes": peak_bytes()}
+    return Product({"weights": trained.weights, "samples": trained.samples}, trained.curves, facts)
+
+
+def encode_policy_set(job: CellJob, encoder: Product | None, report: Report) -> Latents:
+    """Return the latents of the policy set: the encoder's, or the true state."""
+    started = time.perf_counter()
+    store, device, facts = _begin(job, report)
+    policy = store.policy
+    rows = {split: policy.indices(split) for split in ("train", "test")}
+    if encoder is None:
+        state = true_state(policy.labels, store.manifest["sources"]["policy"], job.drives)
+        z = {split: state[indices] for split, indices in rows.items()}
+    else:
+        weights = encoder.parts["weights"]
+        z = {split: encode(weights, policy.images, indices, device=device) for split, indices in rows.items()}
+    labels = {split: policy.labels.iloc[indices].reset_index(drop=True) for split, indices in rows.items()}
+    facts |= {"encoder_test": len(store.encoder.indices("test"))}
+    facts |= {"seconds": time.perf_counter() - started, "peak_bytes": peak_bytes()}
+    return Latents(z["train"], z["test"], labels["train"], labels["test"], facts)
+
+
+def train_policy_share(job: CellJob, latents: Latents, seeds: list[int], report: Report) -> Product:
+    """Train the policies of these seeds."""
+    trained = train_policies(
+        latents.z_train,
+        latents.z_test,
+        latents.labels_train,
+        latents.labels_test,
+        seeds,
+        job.settings.policy,
+        device=_set_up(job, report),
+        log=partial(report, "log"),
+        progress=partial(report, "progress"),
+    )
+    predictions: Arrays = {"acceleration": trained.acceleration, "steering": trained.steering}
+    facts = {"seconds": trained.seconds, "peak_bytes": peak_bytes()}
+    return Product({"weights": trained.weights, "predictions": predictions}, trained.curves, facts)
+
+
+def assemble_result(
+    job: CellJob, encoder: Product | None, latents: Latents, policies: list[Product]
+) -> tuple[CellResult, bytes]:
+    """Return the result of the cell and its exported network."""
+    joined = join_policies(
+        [
+            TrainedPolicies(
+                share.parts["weights"], share.curves, **share.parts["predictions"], seconds=share.facts["seconds"]
+            )
+            for share in policies
+        ]
+    )
+    encoder_curves = encoder.curves if encoder else joined.curves[ENCODER_CURVES][:0]
+    curves = pd.concat([encoder_curves.assign(policy_seed=NO_SEED, stage="encoder"), joined.curves], ignore_index=True)
+    labels, first = latents.labels_test, (encoder or latents).facts
+    seconds: dict[str, float] = {
+        "encoder": encoder.facts["seconds"] if encoder else 0.0,
+        "encode": latents.facts["seconds"],
+        "policies": joined.seconds,
+    }
+    result = CellResult(
+        cell=job.cell,
+        key=job.key,
+        settings=job.settings.model_dump(mode="json")
+        | {"policy_seeds": job.policy_seeds, "frames_key": job.frames.name},
+        curves=curves,
+        encoder=encoder.parts["weights"] if encoder else {},
+        policies=joined.weights,
+        samples=encoder.parts["samples"] if encoder else {},
+        predictions={
+            "acceleration": joined.acceleration,
+            "steering": joined.steering,
+            "acceleration_label": labels["acceleration"].to_numpy(np.uint8),
+            "steering_label": labels["steering"].to_numpy(np.float32),
+            "episode": labels["episode"].to_numpy(np.int32),
+            **{name: labels[name].to_numpy() for name in PROBED},
+            "z": latents.z_test,
+        },
+        facts={
+            "floor": float(np.bincount(labels["acceleration"]).max() / len(labels)),
+            "frames": {
+                "encoder_train": encoder.facts["frames"] if encoder else 0,
+                "encoder_test": latents.facts["encoder_test"],
+                "policy_train": len(latents.labels_train),
+                "policy_test": len(labels),
+            },
+            "seconds": seconds | {"cell": sum(seconds.values())},
+            "peak_bytes": max(part.facts["peak_bytes"] for part in (encoder or latents, latents, *policies)),
+            "device": first["device"],
+            "precision": encoder.facts["precision"] if encoder else "fp32",
+            "threads": job.threads,
+            "provenance": first["provenance"],
+        },
+    )
+    return result, export_driver(result) if encoder else b""
+
+
+def _begin(job: CellJob, report: Report) -> tuple[FrameStore, str, dict[str, Any]]:
+    """Return the frames, made here where they are missing, the device, and facts about what computes."""
+    load_heads(job.head_modules)
+    device = _set_up(job, report)
+    seeds = {
+        "recording": job.settings.recording.seed,
+        "frames": job.settings.frames.seed,
+        "encoder": job.cell.encoder_seed,
+        "policies": list(range(job.policy_seeds)),
+    }
+    # Now, not at the end: the code that runs is the one that was loaded, whatever is edited meanwhile.
+    origin = provenance() | {"determinism": describe_determinism(), "seeds": seeds}
+    if not (job.frames / "manifest.json").is_file():
+        run_flow(data_flow(job.settings, job.scratch, job.imported))
+    store = open_frames(job.frames)
+    if cell_key(job.settings, job.cell, job.policy_seeds, store.key) != job.key:
+        raise BadInputError(
+            f"{job.frames} is not the frame store that {job.cell.label} was planned on; plan the sweep again"
+        )
+    return store, device, {"device": device_name(device), "provenance": origin}
+
+
+def _set_up(job: CellJob, report: Report) -> str:
+    """Set the number of threads, and return the device."""
+    torch.set_num_threads(job.threads)
+    device = choose_device(job.device)
+    report("device", device_name(device))
+    return device
