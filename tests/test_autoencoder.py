@@ -333,11 +333,11 @@ def test_data_on_a_device_and_data_copied_ahead_give_the_batches_of_the_mapped_f
     plan, cpu = plan_training(frames, 1.0, 0, SETTINGS, FRAMES), torch.device("cpu")
     tensors = torch.tensor(frames.images), torch.tensor(frames.masks)
     for parts in (plan.parts(0), plan.parts(1)[:2], np.array_split(plan.subset, 9)):  # fewer and more than are ahead
-        mapped = list(batches._Batches(frames.images, frames.masks, parts, cpu))
+        mapped = list(batches.Batches((frames.images, frames.masks), parts, cpu))
         assert [len(images) for images, _ in mapped] == [len(part) for part in parts]
         for others in (
-            batches._Batches(*tensors, parts, cpu),
-            batches.prefetched(frames.images, frames.masks, parts, cpu),
+            batches.Batches(tensors, parts, cpu),
+            batches.prefetched((frames.images, frames.masks), parts, cpu),
         ):
             for one, other in zip(mapped, others, strict=True):
                 assert all(torch.equal(a, b) for a, b in zip(one, other, strict=True))

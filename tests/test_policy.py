@@ -454,7 +454,7 @@ class Wrong:
         Wrong(r"float32 \[300, 63\]", z=lambda z: z[:, 1:]),
         Wrong("not finite", z=lambda z: np.where(z >= z.max(), np.nan, z).astype(np.float32)),
         Wrong("classes 0 to 2", column="acceleration", labels=np.full(TRAIN, 3)),
-        Wrong("'steering' must be 300 finite", labels=np.full(TRAIN, np.nan)),
+        Wrong("must be 300 finite steerings", labels=np.full(TRAIN, np.nan)),
     ],
     ids=lambda wrong: wrong.message,
 )

@@ -1,9 +1,4 @@
-"""Encoders trained with one, two or three decoder heads (Sec. III-B, IV-B), and the latents of a trained one.
-
-The main path is `train_encoder`: Lightning's Trainer over batches that are slices of one uint8 array. Images lie in the
-store as [N, 64, 64, 3], which is channels-last memory already; masks stay packed bits until they are on the device.
-A killed training goes on from its checkpoint and, on a CPU, ends with the bytes of one that was never killed.
-"""
+"""The network that is trained: an encoder with the decoder heads of a head set (Sec. III-B, IV-B)."""
 
 from __future__ import annotations
 
@@ -31,11 +26,10 @@ LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {  # by the name in a he
 class MultiHeadAutoencoder(lightning.LightningModule):
     """An encoder and the decoder heads of a head set, with the loss that trains them (Sec. III-B).
 
-    The loss is the weighted sum over heads of the binary cross-entropy on logits, mean over a head's pixels. With
-    `beta` > 0 comes beta times the Kullback-Leibler divergence of z from N(0, 1), divided by the image's 12,288
-    numbers, so that beta = 1 is the evidence lower bound of `rec`. Losses are averaged over each epoch and split in
-    `means`, on the device: Lightning's own logging would wait for the device at every step.
-    Raises BadInputError for an unknown head set.
+    The loss is the weighted sum over heads of their losses, each a mean over the head's pixels. With `beta` > 0, beta
+    times the Kullback-Leibler divergence of z from N(0, 1) is added, divided by the image's 12,288 numbers, so that
+    beta = 1 is the evidence lower bound of `rec`. Losses are averaged over each epoch and split on the device:
+    Lightning's own logging would wait for it at every step. Raises BadInputError for an unknown head set.
     """
 
     def __init__(self, heads: str, settings: EncoderSettings, encoder_seed: int) -> None:
@@ -55,27 +49,27 @@ class MultiHeadAutoencoder(lightning.LightningModule):
         self.metrics = ("loss", *(f"loss_{head}" for head in self.decoders), *(["loss_kl"] if settings.beta else []))
         self.noise_seed = encoder_seed
         self.noise: torch.Generator | None = None
-        self.noise_state: Tensor | None = None  # to start from, when a training goes on
+        self.noise_state: Tensor | None = None  # of the checkpoint that a training resumes from
         self._fused: _Fused | None = None
         self.reset_means()
 
     def forward(self, images: Tensor) -> dict[str, Tensor]:
-        """Logits of each head for images [B, 3, 64, 64] float in [0, 1]."""
+        """Return the logits of each head for images [B, 3, 64, 64] float in [0, 1]."""
         z = self.encoder(images)
         return {head: decoder(z) for head, decoder in self.decoders.items()}
 
     def losses(self, images: Tensor, masks: Tensor, noise: Tensor | None = None, *, by_head: bool = False) -> Tensor:
-        """The losses named in `metrics`, of images [B, 64, 64, 3] uint8 and masks [B, 2, 512] uint8.
+        """Return the losses named in `metrics`, of images [B, 64, 64, 3] uint8 and masks [B, K, 512] uint8.
 
         `noise` [B, 64] float32 moves z within its variance, when variational. The losses carry gradients. With
-        `by_head` they carry none: those of the total loss are added to the parameters' on the way, one head after the
+        `by_head` they carry none: the gradients of the total loss are added to the parameters' one head after the
         other, so that memory for the activations of one head suffices.
         """
         pixels = to_float(images)
         targets = unpack(masks, self._mask_places)
         features = self.encoder.features(pixels)
         z = self.encoder.mean(features)
-        ends: list[tuple[Tensor, Tensor | None]] = []  # of the encoder's graph, with the gradient that comes in there
+        ends: list[tuple[Tensor, Tensor | None]] = []  # of the encoder's graph, with incoming gradients
         divergence = []
         if self.encoder.log_variance is not None:
             mean, log_variance = z.float(), self.encoder.log_variance(features).float()
@@ -109,7 +103,7 @@ class MultiHeadAutoencoder(lightning.LightningModule):
         return torch.randn((count, LATENT), generator=self.noise, device=self.device)
 
     def training_step(self, batch: tuple[Tensor, Tensor]) -> None:
-        """One step of the optimiser."""
+        """Take one step of the optimiser."""
         optimizer = self.optimizers(use_pl_optimizer=False)
         assert isinstance(optimizer, torch.optim.Optimizer)
         optimizer.zero_grad()
@@ -117,21 +111,21 @@ class MultiHeadAutoencoder(lightning.LightningModule):
         optimizer.step()
 
     def validation_step(self, batch: tuple[Tensor, Tensor]) -> None:
-        """Losses of a batch of the test split."""
+        """Add the losses of a batch of the test split to the means."""
         losses = self._fused(*batch, None) if self._fused else None
         self._note("test", self.losses(*batch) if losses is None else losses, len(batch[0]))
 
     def gradients(self, images: Tensor, masks: Tensor, noise: Tensor | None) -> Tensor:
-        """The losses of a batch, as `losses` has them; adds the gradients of their total to the parameters'."""
+        """Return the losses of a batch, and add the gradients of their total to the parameters'."""
         losses = self._fused(images, masks, noise) if self._fused else None
         return self.losses(images, masks, noise, by_head=True) if losses is None else losses
 
     def fuse(self) -> None:
-        """From now on take losses and gradients by torch.compile, where that works."""
+        """Compute losses and gradients by torch.compile from now on, where that works."""
         self._fused = _Fused(self)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
-        """Adam (Sec. IV-B)."""
+        """Return Adam (Sec. IV-B)."""
         return torch.optim.Adam(self.parameters(), lr=self.settings.lr, fused=True)
 
     def _note(self, split: Split, losses: Tensor, count: int) -> None:
@@ -140,27 +134,28 @@ class MultiHeadAutoencoder(lightning.LightningModule):
         self.totals[split].append(losses[0])
 
     def reset_means(self) -> None:
-        """Forget the losses seen."""
+        """Start the means of an epoch."""
         self.sums = {name: torch.zeros(len(self.metrics) + 1, dtype=torch.float64) for name in ("train", "test")}
         self.totals: dict[str, list[Tensor]] = {"train": [], "test": []}
 
     def means(self) -> dict[str, float]:
-        """Mean of each loss over the frames seen since the last reset, e.g. "train/loss_rec"; waits for the device."""
-        found: dict[str, float] = {}
+        """Return the mean of each loss since the last reset, e.g. "train/loss_rec"; waits for the device."""
+        means: dict[str, float] = {}
         rows = torch.stack([sums.to(self.device) for sums in self.sums.values()]).tolist()
         for split, (*values, count) in zip(self.sums, rows, strict=True):
-            found |= {f"{split}/{name}": value / count for name, value in zip(self.metrics, values, strict=True)}
-        return found
+            means |= {f"{split}/{name}": value / count for name, value in zip(self.metrics, values, strict=True)}
+        return means
 
     def not_finite(self, split: Split) -> int:
-        """Position since the last reset of the first batch whose loss was not a finite number; there is one."""
+        """Return the position, since the last reset, of the first batch whose loss was not finite; there is one."""
         return int(torch.stack(self.totals[split]).isfinite().int().argmin())
 
 
 class _Fused:
     """An autoencoder's losses and their gradients by torch.compile: one graph for each size of batch and each split.
 
-    A call gives the losses, and in training adds the gradients; or None where it cannot compile, which it says once.
+    A call returns the losses and, in training, adds their gradients to the parameters'. It returns None where
+    compiling fails, after one warning.
     """
 
     def __init__(self, module: MultiHeadAutoencoder) -> None:
@@ -169,16 +164,18 @@ class _Fused:
         self.function: Callable[..., Tensor] | None = torch.compile(module.losses, dynamic=False, fullgraph=True)
         self.compiled: set[tuple[int, bool]] = set()  # sizes, each in training or not
 
-    def __call__(self, *batch: Tensor | None) -> Tensor | None:
-        kind = len(batch[0]), self.module.training  # type: ignore[arg-type]
-        if self.function is None or kind in self.compiled:
-            return self._compute(*batch)
-        before = [buffer.clone() for buffer in self.module.buffers()]
+    def __call__(self, images: Tensor, masks: Tensor, noise: Tensor | None) -> Tensor | None:
+        if self.function is None:
+            return None
+        kind = len(images), self.module.training
+        buffers = [] if kind in self.compiled else [buffer.clone() for buffer in self.module.buffers()]
         try:
-            losses = self._compute(*batch)
-        except torch.OutOfMemoryError:
-            raise
-        except Exception as error:  # noqa: BLE001 - of any kind; what else may be wrong shows without it
+            losses = self.function(images, masks, noise)
+            if self.module.training:
+                torch.autograd.backward(losses[0])
+        except Exception as error:
+            if kind in self.compiled or isinstance(error, torch.OutOfMemoryError):
+                raise
             warnings.warn(
                 f"torch.compile failed ({type(error).__name__}: {str(error).strip().splitlines()[0]}); the encoder "
                 "trains without it, more slowly (TORCH_COMPILE_DISABLE=1 leaves it out)",
@@ -187,16 +184,8 @@ class _Fused:
             )
             self.function = None
             self.module.zero_grad()
-            for buffer, value in zip(self.module.buffers(), before, strict=True):
+            for buffer, value in zip(self.module.buffers(), buffers, strict=True):
                 buffer.copy_(value)
             return None
         self.compiled.add(kind)
-        return losses
-
-    def _compute(self, *batch: Tensor | None) -> Tensor | None:
-        if self.function is None:
-            return None
-        losses = self.function(*batch)
-        if self.module.training:
-            torch.autograd.backward(losses[0])
         return losses.detach()

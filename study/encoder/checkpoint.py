@@ -15,13 +15,12 @@ import torch
 
 from study.errors import BadInputError
 
-DIGEST = hashlib.sha256().digest_size  # bytes, before what torch writes
-ZIP = b"PK"  # how a checkpoint from before there were digests begins
+DIGEST_BYTES = hashlib.sha256().digest_size  # before what torch writes
 
 
 @dataclass
 class TrainingState:
-    """How far a training has come: whole epochs, steps of the next, seconds spent, and the curves so far."""
+    """How far a training has come: complete epochs, steps of the next, seconds spent, and the curves so far."""
 
     epoch: int = 0
     step: int = 0
@@ -36,8 +35,7 @@ class DamagedCheckpointError(Exception):
 def write_checkpoint(path: Path, content: dict[str, Any]) -> None:
     """Write a checkpoint and its digest, atomically."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    # In memory first: torch makes errors of its own of a full disk's, and keeps no digest of what it writes.
-    stream = io.BytesIO()
+    stream = io.BytesIO()  # torch turns the error of a full disk into one of its own, and keeps no digest
     torch.save(content, stream)
     with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as draft:
         try:
@@ -52,24 +50,22 @@ def write_checkpoint(path: Path, content: dict[str, Any]) -> None:
 
 
 def read_checkpoint(path: Path, training: dict[str, Any]) -> dict[str, Any]:
-    """Return what `write_checkpoint` wrote.
+    """Return the content that `write_checkpoint` wrote.
 
-    Raises DamagedCheckpointError, and BadInputError when it belongs to another training.
+    Raises DamagedCheckpointError, and BadInputError when the checkpoint belongs to another training.
     """
     raw = path.read_bytes()
-    if not raw.startswith(ZIP):
-        digest, raw = raw[:DIGEST], raw[DIGEST:]
-        if hashlib.sha256(raw).digest() != digest:
-            raise DamagedCheckpointError(f"{path} does not match its digest")
+    if hashlib.sha256(raw[DIGEST_BYTES:]).digest() != raw[:DIGEST_BYTES]:
+        raise DamagedCheckpointError(f"{path} does not match its digest")
     try:
-        content: dict[str, Any] = torch.load(io.BytesIO(raw), map_location="cpu", weights_only=True)
+        content: dict[str, Any] = torch.load(io.BytesIO(raw[DIGEST_BYTES:]), map_location="cpu", weights_only=True)
         other = content["training"]
-    except (OSError, RuntimeError, EOFError, KeyError, TypeError, ValueError, pickle.UnpicklingError) as error:
+    except (RuntimeError, EOFError, KeyError, TypeError, ValueError, pickle.UnpicklingError) as error:
         raise DamagedCheckpointError(f"{path} is no checkpoint of an encoder ({error})") from error
     for name in sorted(training | other):
         if training.get(name) != other.get(name):
             raise BadInputError(
-                f"checkpoint {path} is of another configuration: {name} is {other.get(name)!r} there and "
-                f"{training.get(name)!r} here; delete it to train anew, or name another file"
+                f"checkpoint {path} belongs to another configuration: {name} is {other.get(name)!r} there and "
+                f"{training.get(name)!r} here; delete it to train from the start, or name another file"
             )
     return content

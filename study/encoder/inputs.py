@@ -19,7 +19,7 @@ Split = Literal["train", "test"]
 
 
 def to_float(images: Tensor) -> Tensor:
-    """Images [B, 64, 64, 3] uint8 as [B, 3, 64, 64] float32 in [0, 1], channels last in memory."""
+    """Return images [B, 64, 64, 3] uint8 as [B, 3, 64, 64] float32 in [0, 1], channels last in memory."""
     return images.permute(0, 3, 1, 2).float().div_(255)
 
 

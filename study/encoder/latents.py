@@ -23,7 +23,7 @@ SAMPLES = 16
 
 
 def choose_samples(frames: Frames) -> Indices:
-    """Rows of up to 16 test frames to show, the same for every encoder: those with most to see, drive by drive.
+    """Return the rows of up to 16 test frames to show, the same for every encoder: the fullest of each drive.
 
     A frame's content is the sum of its ranks among the test frames by the set pixels of each mask.
     """
@@ -38,7 +38,7 @@ def choose_samples(frames: Frames) -> Indices:
 
 
 def paint_samples(module: MultiHeadAutoencoder, frames: Frames, rows: Indices) -> Arrays:
-    """Inputs, each head's outputs and targets of some frames, uint8, as `CellResult.samples` documents."""
+    """Return inputs, outputs and targets of some frames, uint8, as `CellResult.samples` documents."""
     images, masks = torch.from_numpy(frames.images[rows]), torch.from_numpy(frames.masks[rows])
     module.eval()
     with torch.inference_mode():
@@ -53,7 +53,7 @@ def paint_samples(module: MultiHeadAutoencoder, frames: Frames, rows: Indices) -
 
 
 def encoder_of(weights: Mapping[str, NDArray[Any]]) -> Encoder:
-    """The trained network of those weights. Raises BadInputError when they are not an Encoder's."""
+    """Return the trained network of these weights. Raises BadInputError when they are not an Encoder's."""
     encoder = Encoder(variational="log_variance.weight" in weights)
     try:
         encoder.load_state_dict({name: torch.from_numpy(np.array(value)) for name, value in weights.items()})
@@ -65,7 +65,7 @@ def encoder_of(weights: Mapping[str, NDArray[Any]]) -> Encoder:
 def encode(
     weights: Mapping[str, NDArray[Any]], images: Bytes, indices: Indices, *, device: str = "cpu", batch: int = 256
 ) -> NDArray[np.float32]:
-    """Latents z [N, 64] float32 of some rows of `images` [.., 64, 64, 3] uint8; the mean when variational.
+    """Return latents z [N, 64] float32 of some rows of `images` [.., 64, 64, 3] uint8; the mean when variational.
 
     Always computed in float32, so that z depends on the precision of training only through the weights.
     Raises BadInputError when the weights are not an Encoder's, or the device is not there.

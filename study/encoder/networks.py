@@ -35,7 +35,7 @@ class _SubPixel(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, images: Tensor, weight: Tensor, bias: Tensor, extra: int) -> Tensor:
-        """Images [B, C, H, W], weight [C, D, 4, 4], bias [D]; [B, D, 2 H + 2 + extra, ..] channels last."""
+        """Return [B, D, 2 H + 2 + extra, ..] of images [B, C, H, W], weight [C, D, 4, 4], bias [D]; channels last."""
         ctx.save_for_backward(images, weight)
         ctx.extra = extra
         channels = weight.shape[1]
@@ -52,7 +52,7 @@ class _SubPixel(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        """Gradients of images and weight."""
+        """Return the gradients of images and weight."""
         images, weight = ctx.saved_tensors
         two, none, one, extra, transposed = [STRIDE] * 2, [0, 0], [1, 1], [ctx.extra] * 2, True
         of_images, of_weight, _ = torch.ops.aten.convolution_backward(
@@ -62,7 +62,7 @@ class _SubPixel(torch.autograd.Function):
 
 
 def _transposed(layer: nn.ConvTranspose2d, images: Tensor, bias: Tensor) -> Tensor:
-    """A layer's output with another bias in its place, which gets no gradient."""
+    """Return the output of a layer with another bias, which gets no gradient."""
     extra = layer.output_padding[0]
     if images.device.type == "cpu":
         # Autocast does not look into the function: the layer computes in the type that it is given.
@@ -97,12 +97,12 @@ class Encoder(nn.Module):
         self.log_variance = nn.Linear(_CORE_NUMBERS, LATENT) if variational else None
 
     def features(self, images: Tensor) -> Tensor:
-        """What the fully connected layers see: [B, 4608], pixel by pixel, as channels-last memory has it."""
+        """Return the input [B, 4608] of the fully connected layers, pixel by pixel as in channels-last memory."""
         features: Tensor = self.convolutions(images)
         return features.permute(0, 2, 3, 1).flatten(1)
 
     def forward(self, images: Tensor) -> Tensor:
-        """The latent; its mean when variational."""
+        """Return the latent; its mean when variational."""
         z: Tensor = self.mean(self.features(images))
         return z
 
@@ -116,7 +116,7 @@ class Decoder(nn.Module):
             nn.Linear(LATENT, _CORE_NUMBERS), nn.BatchNorm1d(_CORE_NUMBERS), nn.ReLU(inplace=True)
         )
         layers: list[nn.Module] = []
-        # 6 -> 14 -> 31 -> 64 without padding: the middle layer needs one row and column more (PAPER.md 2.2)
+        # 6 -> 14 -> 31 -> 64 without padding: the middle layer needs one row and column more (docs/paper.md)
         for (before, after), extra in zip(itertools.pairwise(CHANNELS[::-1]), (0, 1), strict=True):
             layers += [
                 _TransposedConvolution(before, after, KERNEL, STRIDE, output_padding=extra),
@@ -127,7 +127,7 @@ class Decoder(nn.Module):
         self.output = nn.ConvTranspose2d(CHANNELS[0], channels, KERNEL, STRIDE)
 
     def forward(self, z: Tensor) -> Tensor:
-        """Logits; a sigmoid makes them the paper's output."""
+        """Return logits; a sigmoid makes them the paper's output."""
         core = self.fully_connected(z).view(-1, CORE, CORE, CHANNELS[-1]).permute(0, 3, 1, 2)
         # The bias is added in float32, where its gradient is exact, and faster than inside the convolution.
         assert self.output.bias is not None

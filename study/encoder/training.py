@@ -1,4 +1,7 @@
-"""Train one encoder, with checkpoints and a check of memory."""
+"""Train one encoder: Lightning's Trainer over batches that are slices of one uint8 array.
+
+A killed training resumes from its checkpoint and, on a CPU, ends with the bytes of one that was never killed.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,7 @@ from study.config.paper import CHANNELS, IMAGE, KERNEL, STRIDE
 from study.config.settings import EncoderSettings, FramesSettings
 from study.data.frames import Frames
 from study.encoder.autoencoder import MultiHeadAutoencoder
-from study.encoder.batches import FUSED_STEPS, TrainingData, TrainingPlan, plan_training
+from study.encoder.batches import TrainingData, TrainingPlan, plan_training, resident
 from study.encoder.checkpoint import DamagedCheckpointError, TrainingState, read_checkpoint, write_checkpoint
 from study.encoder.inputs import Split
 from study.encoder.latents import choose_samples, paint_samples
@@ -38,25 +41,26 @@ Log = Callable[[int, dict[str, float]], None]
 Progress = Callable[[int, int], None]
 CHECKPOINT_SECONDS = 60.0  # between two checkpoints of 23 MB: what a kill costs at most
 PROGRESS_SECONDS = 0.25
+FUSED_STEPS = 10_000  # compiling takes about a minute: it must be worth it
 SPARE_BYTES = 1 << 30  # of a GPU's memory, for the libraries' work space and for gaps
 
 
 def step_bytes(heads: str, batch: int, precision: str) -> int:
-    """Memory that a training step takes on a GPU beside the data; from above [bytes].
+    """Return an upper bound of the memory that a training step takes on a GPU beside the data [bytes].
 
     For each image: every layer's output before and after its BatchNorm and one gradient, in the type of training, and
     five times each head's pixels in float32 (target, logits, their gradient and what leads there).
     """
     sides = list(itertools.accumulate(CHANNELS, lambda side, _: (side - KERNEL) // STRIDE + 1, initial=IMAGE))[1:]
     layers = sum(channels * side**2 for channels, side in zip(CHANNELS, sides, strict=True))
-    colours = sum(HEADS[head].channels for head in HEAD_SETS[heads].heads)
-    image = 3 * (2 if precision == "bf16" else 4) * layers * (1 + len(HEAD_SETS[heads].heads))
-    image += 5 * 4 * (3 + colours) * IMAGE**2
+    head_set = HEAD_SETS[heads].heads
+    image = 3 * (2 if precision == "bf16" else 4) * layers * (1 + len(head_set))
+    image += 5 * 4 * (3 + sum(HEADS[head].channels for head in head_set)) * IMAGE**2
     return batch * image + SPARE_BYTES
 
 
 def check_memory(device: torch.device, heads: str, batch: int, precision: str) -> int:
-    """Bytes of a device's memory that are free for the data. Raises BadInputError when a training step cannot fit."""
+    """Return the bytes of a GPU that are free for the data. Raises BadInputError when a training step cannot fit."""
     free, _ = torch.cuda.mem_get_info(device)
     need = step_bytes(heads, batch, precision)
     if need > free:
@@ -100,9 +104,9 @@ def train_encoder(
     """Train an encoder with a head set on a fraction of the training frames (Sec. IV-B, V-B).
 
     `log(epoch, losses)` is called after each epoch, counted from 1, with losses such as "test/loss_rec"; after a resume
-    first for the epochs that were done before. `progress(steps done, steps in all)` comes a few times a second.
-    `checkpoint` is the file that a killed training goes on from; it stays when the training is done. One that was
-    damaged on disk is told and not used.
+    first for the epochs that were done before. `progress(done, total)` counts steps, a few times a second.
+    `checkpoint` is the file that a killed training resumes from; it stays when the training is done. A damaged one is
+    reported and not used.
     Raises BadInputError for a head set, device, batch or checkpoint that cannot be used, and TrainingDivergedError,
     naming epoch and step, for a loss that is not finite.
     """
@@ -123,24 +127,44 @@ def train_encoder(
         "weights": {head: settings.head_weights.get(head, 1.0) for head in HEAD_SETS[heads].heads},
         **settings.model_dump(mode="json", exclude={"precision", "budget", "head_weights"}),
     }
-    course = _Course(module, plan, training, checkpoint, log, progress)
-    course.resume()
-    if course.state.epoch < plan.epochs:
-        _fit(module, TrainingData(frames, plan, course.state, target, room), course, target, precision)
-        course.save()
+    monitor = _Monitor(module, plan, training, checkpoint, log, progress)
+    monitor.resume()
+    state = monitor.state
+    epochs = plan.epochs - state.epoch
+    if epochs:
+        if target.type == "cpu":
+            keep_memory()
+        else:
+            module.to(memory_format=torch.channels_last)
+            if epochs * plan.steps >= FUSED_STEPS:
+                module.fuse()
+        data = TrainingData(resident(frames, target, room), plan, state, target)
+        with trainer(
+            target,
+            epochs,
+            f"batch {plan.batch}",
+            "lower --encoder.batch",
+            precision="bf16-mixed" if precision == "bf16" else "32-true",
+            callbacks=[monitor],
+            num_sanity_val_steps=0,
+            benchmark=target.type == "cuda",  # sizes of batches hardly change: let cuDNN try which kernel is fastest
+            reload_dataloaders_every_n_epochs=1,
+        ) as lightning_trainer:
+            lightning_trainer.fit(module, datamodule=data)
+        monitor.save()
     encoder = {name: value.numpy(force=True).copy() for name, value in module.encoder.state_dict().items()}
     return TrainedEncoder(
         weights=encoder,
-        curves=pd.DataFrame(course.state.rows, columns=["split", "epoch", "metric", "value"]),
+        curves=pd.DataFrame(state.rows, columns=["split", "epoch", "metric", "value"]),
         samples=paint_samples(module, frames, choose_samples(frames)),
         frames=len(plan.subset),
-        seconds=course.state.seconds,
+        seconds=state.seconds,
         precision=precision,
     )
 
 
-class _Course(lightning.Callback):
-    """Follows a training: counts, logs each epoch, keeps the checkpoint, and stops at a loss that is not finite."""
+class _Monitor(lightning.Callback):
+    """Counts steps, logs each epoch, keeps the checkpoint, and stops the training at a loss that is not finite."""
 
     def __init__(
         self,
@@ -161,13 +185,13 @@ class _Course(lightning.Callback):
         self.sigterm = signal.getsignal(signal.SIGTERM)
 
     def resume(self) -> None:
-        """Take up the checkpoint, when there is one."""
+        """Resume from the checkpoint, where there is one."""
         if self.checkpoint is None or not self.checkpoint.exists():
             return
         try:
             content = read_checkpoint(self.checkpoint, self.training)
         except DamagedCheckpointError as error:
-            print(f"damaged checkpoint: {error}; the encoder is trained anew", file=sys.stderr)
+            print(f"damaged checkpoint: {error}; the encoder is trained from the start", file=sys.stderr)
             return
         self.module.load_state_dict(content["network"])
         self.module.sums["train"] = content["sums"]
@@ -180,7 +204,7 @@ class _Course(lightning.Callback):
             self.report(epoch, {f"{split}/{metric}": value for split, _, metric, value in lines})
 
     def save(self) -> None:
-        """Write the checkpoint, unless a loss was not finite: then there is nothing worth going on from."""
+        """Write the checkpoint. Raises TrainingDivergedError when a loss was not finite."""
         now = time.monotonic()
         self.state.seconds += now - self.started
         self.started = self.saved = now
@@ -242,29 +266,6 @@ class _Course(lightning.Callback):
         return TrainingDivergedError(
             f"the loss is not a finite number in epoch {self.state.epoch + 1}, {where}; lower --encoder.lr"
         )
-
-
-def _fit(
-    module: MultiHeadAutoencoder, data: TrainingData, course: _Course, device: torch.device, precision: str
-) -> None:
-    if device.type == "cpu":
-        keep_memory()
-    else:
-        module.to(memory_format=torch.channels_last)
-        if (data.plan.epochs - data.state.epoch) * data.plan.steps >= FUSED_STEPS:
-            module.fuse()
-    with trainer(
-        device,
-        data.plan.epochs - data.state.epoch,
-        f"batch {data.plan.batch}",
-        "lower --encoder.batch",
-        precision="bf16-mixed" if precision == "bf16" else "32-true",
-        callbacks=[course],
-        num_sanity_val_steps=0,
-        benchmark=device.type == "cuda",  # sizes of batches hardly change: let cuDNN try which kernel is fastest
-        reload_dataloaders_every_n_epochs=1,
-    ) as lightning_trainer:
-        lightning_trainer.fit(module, datamodule=data)
 
 
 def _fingerprint(frames: Frames, plan: TrainingPlan) -> str:

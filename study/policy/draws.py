@@ -17,17 +17,16 @@ _INIT, _EPOCH, SUBSET = range(3)  # purposes of random numbers
 
 
 class Draws(NamedTuple):
-    """All chance of one epoch: `order` [S, N] int64 and, for each hidden layer, bits [S, N * H / 32] int32."""
+    """All random numbers of one epoch: `order` [S, N] int64 and, for each hidden layer, bits [S, N * H / 32] int32."""
 
     order: Tensor
     bits: dict[str, tuple[Tensor, Tensor]]
 
 
 def draw_epoch(seeds: Sequence[int], epoch: int, frames: int, device: torch.device | str = "cpu") -> Draws:
-    """The order of the data and the dropout bits of each seed, a function of (seed, epoch) only.
+    """Return the order of the data and the dropout bits of each seed, a function of (seed, epoch) only.
 
-    Made on the CPU whatever the device, so that a seed means the same everywhere; a GPU then copies both arrays while
-    it computes.
+    They are drawn on the CPU, so that a seed means the same on every device; a GPU copies them while it computes.
     """
     words = {name: tuple(width // WORD for width in widths[1:-1]) for name, widths in WIDTHS.items()}
     ends = np.cumsum([0, *(frames * each for layers in words.values() for each in layers)]).tolist()
@@ -39,13 +38,13 @@ def draw_epoch(seeds: Sequence[int], epoch: int, frames: int, device: torch.devi
         rng = np.random.Generator(np.random.SFC64([seed, _EPOCH, epoch]))
         orders[row] = rng.permutation(frames)
         random_words[row] = rng.bit_generator.random_raw(math.ceil(ends[-1] / 2)).view(np.int32)[: ends[-1]]
-    there = bits.to(device, non_blocking=True)
-    parts = iter([there[:, a:b] for a, b in itertools.pairwise(ends)])
+    on_device = bits.to(device, non_blocking=True)
+    parts = iter([on_device[:, a:b] for a, b in itertools.pairwise(ends)])
     return Draws(order.to(device, non_blocking=True), {name: (next(parts), next(parts)) for name in WIDTHS})
 
 
 def initial_weights(seed: int) -> Iterator[tuple[str, Tensor]]:
-    """One policy's weights by name, as torch's Linear draws them: uniform within 1 / sqrt(inputs)."""
+    """Yield one policy's weights by name, as torch's Linear draws them: uniform within 1 / sqrt(inputs)."""
     rng = np.random.default_rng([seed, _INIT])
     for name, widths in WIDTHS.items():
         for slot in slots(name):

@@ -1,11 +1,12 @@
 """Policies on a frozen latent (Sec. III-B.3, IV-C): all seeds at once, as one stack of tensors.
 
-Two small networks with no weight in common learn from z: one gives the steering, one the logits of the three
-accelerations. The seeds never touch each other: the loss is their sum and Adam works number by number, so each seed
-becomes what it would have become alone, whichever seeds are trained beside it and wherever: shares of the seeds can be
-trained by different processes, and `join_policies` puts them together. A unit of work is one network on a group of
-seeds. On a CPU a group is one seed, whose step fits into one core's cache, computed on one thread: threads inside an
-operation would wait for each other forty times a step. On a GPU all seeds are one group.
+Two small networks without shared weights learn from z: one gives the steering, one the logits of the three
+accelerations. Seeds do not influence each other: the loss is their sum and Adam works number by number. A seed ends the
+same whichever seeds are trained beside it, so shares of the seeds can be trained by different processes.
+
+A unit of work is one network on a group of seeds. On a CPU a group is one seed, whose step fits into one core's cache,
+computed on one thread: threads inside an operation would wait for each other forty times a step. On a GPU all seeds are
+one group.
 
 Suffixes: S seeds, G seeds of a group, B rows of a batch, N frames, H hidden units, O outputs, Z = 64 latent numbers.
 """
@@ -34,9 +35,9 @@ AfterEpoch = Callable[[int, Arrays], None]
 
 @dataclass(frozen=True)
 class PolicyData:
-    """What policies learn from and are measured on; x as `normalise` gives it.
+    """The data of policies: `x` [N, 64], normalised, and `labels` of the train split.
 
-    `x` [N, 64] and `labels` of the train split; `views`: for each split the x and labels that metrics are taken on.
+    `views`: for each split the x and labels that metrics are taken on.
     """
 
     x: Tensor
@@ -47,16 +48,12 @@ class PolicyData:
 class PolicyEnsemble(lightning.LightningModule):
     """S policies as stacked tensors: for each network a row of numbers a seed, and its layers as views of the rows.
 
-    One training step is one batch of every seed. `after_epoch(epoch, {split: METRICS [4, S]})` hears of each epoch:
-    on a GPU the only moment at which anyone waits for it.
+    One training step is one batch of every seed. `after_epoch(epoch, {split: METRICS [4, S]})` is called after each
+    epoch; only then does the process wait for a GPU.
     """
 
     def __init__(
-        self,
-        seeds: Sequence[int],
-        settings: PolicySettings,
-        data: PolicyData,
-        after_epoch: AfterEpoch,
+        self, seeds: Sequence[int], settings: PolicySettings, data: PolicyData, after_epoch: AfterEpoch
     ) -> None:
         super().__init__()
         self.automatic_optimization = False
@@ -68,7 +65,7 @@ class PolicyEnsemble(lightning.LightningModule):
         self._groups = _groups(len(self.seeds), data.x.device)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
-        """Adam; fused, because the stack is small numbers in many places."""
+        """Return Adam; fused, because the stack has few numbers in many places."""
         return torch.optim.Adam(self.parameters(), lr=self.settings.lr, fused=True)
 
     def on_train_start(self) -> None:
@@ -87,7 +84,7 @@ class PolicyEnsemble(lightning.LightningModule):
         ]
 
     def weights(self) -> Arrays:
-        """Weights [S, in, out] and biases [S, out] by name."""
+        """Return weights [S, in, out] and biases [S, out] by name."""
         return {
             slot.key: np.ascontiguousarray(slot.cut(self.stacks[name].detach()).cpu().numpy())
             for name in WIDTHS
@@ -95,7 +92,7 @@ class PolicyEnsemble(lightning.LightningModule):
         }
 
     def on_train_epoch_start(self) -> None:
-        """Take the epoch's chance, and bring the labels into its order."""
+        """Draw the random numbers of the epoch, and bring the labels into its order."""
         self._order, self._bits = self._ahead or self._draw(self.current_epoch)
         self._ahead = None
         self._steering = self._data.labels.steering[self._order]
@@ -105,7 +102,7 @@ class PolicyEnsemble(lightning.LightningModule):
         return draw_epoch(self.seeds, epoch, len(self._data.x), self._data.x.device)
 
     def training_step(self, batch: int) -> None:
-        """One batch of every seed: the rows at `batch` in each seed's own order."""
+        """Train one batch of every seed: the rows at `batch` in the order of each seed."""
         start = batch * self.settings.batch
         rows = slice(start, min(start + self.settings.batch, len(self._data.x)))
         with torch.inference_mode():
@@ -142,9 +139,8 @@ class PolicyEnsemble(lightning.LightningModule):
         self._after_epoch(self.current_epoch + 1, dict(zip(views, measured.cpu().numpy(), strict=True)))
 
     def outputs(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Steering [S, N] and logits [S, N, 3] without dropout."""
+        """Return steering [S, N] and logits [S, N, 3] without dropout."""
         results = {name: x.new_empty((len(self.seeds), len(x), widths[-1])) for name, widths in WIDTHS.items()}
-
         with torch.inference_mode():
             for name, index in self._units():
                 layers = [(layer.weight, layer.bias) for layer in self._layers[name][index]]
@@ -152,32 +148,32 @@ class PolicyEnsemble(lightning.LightningModule):
         return results["steering"][..., 0], results["acceleration"]
 
     def _units(self) -> Iterator[tuple[str, int]]:
-        """Each network with each group."""
+        """Return each network with each group."""
         return itertools.product(WIDTHS, range(len(self._groups)))
 
 
 def _groups(seeds: int, device: torch.device) -> list[slice]:
-    """Which seeds are computed at once."""
+    """Return the seeds that are computed at once."""
     return [slice(0, seeds)] if device.type == "cuda" else [slice(seed, seed + 1) for seed in range(seeds)]
 
 
 def _steering_gradient(outputs: Tensor, labels: Tensor) -> Tensor:
-    """Gradient of the mean smooth L1 loss; outputs and labels [G, 1, B]."""
+    """Return the gradient of the mean smooth L1 loss; outputs and labels [G, 1, B]."""
     return outputs.sub_(labels).clamp_(-1, 1).div_(outputs.shape[2])
 
 
 def _acceleration_gradient(logits: Tensor, labels: Tensor) -> Tensor:
-    """Gradient of the mean cross-entropy; logits [G, 3, B], labels [G, 1, B]."""
+    """Return the gradient of the mean cross-entropy; logits [G, 3, B], labels [G, 1, B]."""
     gradient = logits.softmax(1)
     gradient.scatter_add_(1, labels, gradient.new_full((), -1.0).expand_as(labels))
     return gradient.div_(logits.shape[2])
 
 
 def stack(seeds: Sequence[int], name: str) -> Tensor:
-    """Initial weights of all seeds, [S, numbers]: a row for each, padded to whole vectors of the processor.
+    """Return the initial weights of all seeds [S, numbers], rows padded to full vectors of the processor.
 
-    Adam would round the numbers of a last, half-filled vector differently, and a seed's result would depend on where it
-    stands in the stack.
+    Adam would round the numbers of a last, half-filled vector differently, and a seed's result would depend on its
+    place in the stack.
     """
     places = slots(name)
     used = places[-1].start + math.prod(places[-1].shape)

@@ -14,7 +14,7 @@ Arrays = dict[str, NDArray[Any]]
 
 
 def normalisation(z_train: NDArray[np.float32], how: str) -> Arrays:
-    """What `normalise` needs to know, from the policy train split only (PAPER.md 2.5)."""
+    """Return the numbers that `normalise` needs, from the policy train split only (docs/paper.md)."""
     mean, std = np.zeros(LATENT, np.float32), np.ones(LATENT, np.float32)
     if how == "zscore":
         mean, std = z_train.mean(0, dtype=np.float64), z_train.std(0, dtype=np.float64)
@@ -27,7 +27,7 @@ def normalisation(z_train: NDArray[np.float32], how: str) -> Arrays:
 
 
 def normalise(weights: Mapping[str, NDArray[Any]], z: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The latent [N, 64] as the policies see it."""
+    """Return the latent [N, 64] as the policies see it."""
     scaled: NDArray[np.float32] = (z - weights["z_mean"]) / weights["z_std"]
     if weights["z_l2"][0]:
         scaled /= np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), np.finfo(np.float32).tiny)

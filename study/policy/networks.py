@@ -23,7 +23,7 @@ WIDTHS = {
 WORD = 32  # random bits in an int32
 _TWO = 30  # the one bit that makes an int32 the float32 2.0
 VECTOR = 16  # float32 in the widest register
-_DROPPED = -1e30  # takes a unit below zero, where the ReLU ends it
+_DROPPED = -1e30  # starts the sum of a dropped unit far below zero
 _KEPT = 1 / (1 - DROPOUT)
 _ROWS = 2048  # evaluated at once: their hidden units fit into a core's cache
 
@@ -39,18 +39,18 @@ class Slot(NamedTuple):
     shape: tuple[int, ...]
 
     def cut(self, rows: Tensor) -> Tensor:
-        """This weight [G, in, out] or bias [G, out] of rows [G, numbers], without a copy."""
+        """Return this weight [G, in, out] or bias [G, out] of rows [G, numbers], without a copy."""
         return rows[:, self.start : self.start + math.prod(self.shape)].view(-1, *self.shape)
 
 
 def slots(name: str) -> list[Slot]:
-    """Weights and biases of a network in their order, layer by layer."""
-    found, start = [], 0
+    """Return the weights and biases of a network in their order, layer by layer."""
+    places, start = [], 0
     for layer, (inputs, outputs) in enumerate(itertools.pairwise(WIDTHS[name])):
         for part, shape in (("weight", (inputs, outputs)), ("bias", (outputs,))):
-            found.append(Slot(f"{name}_{layer}_{part}", layer, start, shape))
+            places.append(Slot(f"{name}_{layer}_{part}", layer, start, shape))
             start += math.prod(shape)
-    return found
+    return places
 
 
 class Layer(NamedTuple):
@@ -63,13 +63,13 @@ class Layer(NamedTuple):
 
 
 class Scratch:
-    """Memory that every pass uses again: fresh pages from the system cost as much as the products do."""
+    """Memory that every pass reuses: fresh pages from the system cost as much as the matrix products."""
 
     def __init__(self) -> None:
         self._kept: dict[tuple[str, torch.dtype], Tensor] = {}
 
     def take(self, use: str, shape: tuple[int, ...], like: Tensor) -> Tensor:
-        """A tensor of that shape, with anything in it; the last one for the same use is lost."""
+        """Return an uninitialised tensor of that shape; it overwrites the last one for the same use."""
         size, key = math.prod(shape), (use, like.dtype)
         kept = self._kept.get(key)
         if kept is None or kept.numel() < size:
@@ -83,7 +83,7 @@ def _shifts(device: torch.device) -> Tensor:
 
 
 def dropped(words: Tensor, rows: int, scratch: Scratch, use: str = "dropped") -> Tensor:
-    """Words of 32 random bits [G, B * H / 32] int32 as float32 [G, B, H]: 2.0 where the bit is set, 0.0 where not."""
+    """Return words of 32 random bits [G, B * H / 32] int32 as float32 [G, B, H]: 2.0 where a bit is set, else 0.0."""
     words = words[:, None]
     bits = scratch.take(use, (len(words), WORD, words.shape[2]), words)
     torch.bitwise_left_shift(words, _shifts(words.device), out=bits[:, :-1])  # bits 0 to 30
@@ -98,11 +98,11 @@ def forward_backward(
     output_gradient: Callable[[Tensor], Tensor],
     scratch: Scratch,
 ) -> None:
-    """One pass of G policies over their batches x [G, B, 64]; writes the gradients of all layers.
+    """Write the gradients of all layers of G policies for their batches x [G, B, 64].
 
     `output_gradient` maps outputs [G, O, B] to the loss's gradient there. A unit to drop starts its sum far below zero,
-    so the ReLU drops it, and its zero tells the way back, too: dropout costs the two passes over memory that make the
-    mask. What dropout multiplies by, 2, waits for the next product.
+    so that the ReLU drops it, forward and backward: dropout costs only the two passes over memory that make the mask.
+    Its factor of 2 is applied in the next product.
     """
     groups, rows, _ = x.shape
     activations = [x]
@@ -123,12 +123,12 @@ def forward_backward(
 
 
 def outputs(weights: Sequence[tuple[Tensor, Tensor]], x: Tensor) -> Tensor:
-    """Outputs [G, N, O] of G policies without dropout for x [N, 64]."""
+    """Return outputs [G, N, O] of G policies without dropout for x [N, 64]."""
     return torch.cat([through(weights, x[start : start + _ROWS]) for start in range(0, len(x), _ROWS)], 1)
 
 
 def through(weights: Sequence[tuple[Tensor, Tensor]], x: Tensor) -> Tensor:
-    """The same in one pass: weights [G, in, out] and biases [G, 1, out] layer by layer."""
+    """Return the same from one pass: weights [G, in, out] and biases [G, 1, out] layer by layer."""
     hidden = x.expand(len(weights[0][0]), -1, -1)
     for depth, (weight, bias) in enumerate(weights):
         hidden = torch.baddbmm(bias, hidden, weight)
@@ -138,7 +138,7 @@ def through(weights: Sequence[tuple[Tensor, Tensor]], x: Tensor) -> Tensor:
 
 
 def predict(weights: Mapping[str, NDArray[Any]], z: NDArray[np.float32]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Steering [S, N] and logits of the accelerations [S, N, 3], float32, for latents [N, 64] as encoded."""
+    """Return steering [S, N] and logits of the accelerations [S, N, 3], float32, for latents [N, 64] as encoded."""
     x = torch.from_numpy(normalise(weights, z))
     results = {}
     with torch.inference_mode():

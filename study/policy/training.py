@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +12,7 @@ import numpy as np
 import pandas as pd
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from study.compute.trainer import trainer
 from study.config.paper import ACCELERATIONS, LATENT
@@ -31,7 +31,7 @@ Labelled = tuple[NDArray[np.float32], pd.DataFrame]  # latents [N, 64] and their
 
 @dataclass(frozen=True)
 class TrainedPolicies:
-    """S trained policies and how they came about; N test frames.
+    """S trained policies and their curves; N test frames.
 
     `weights`: "<network>_<layer>_weight" [S, in, out] and "..._bias" [S, out] float32 for networks "steering" and
     "acceleration", layers 0 to 2; "z_mean", "z_std" [64]; "z_l2" [1] uint8: 1 where z is scaled to unit length.
@@ -71,30 +71,40 @@ def train_policies(
     points: list[pd.DataFrame] = []
 
     def after_epoch(epoch: int, values: Arrays) -> None:
-        for metrics in values.values():
-            broken = ~np.isfinite(metrics).all(0)
-            if broken.any():
-                raise TrainingDivergedError(
-                    f"policies: the loss of seed {seeds[int(broken.argmax())]} is not finite after epoch {epoch}; "
-                    f"try a lower policy.lr than {settings.lr:g}"
-                )
+        broken = ~np.isfinite(np.stack(list(values.values()))).all(axis=(0, 1))
+        if broken.any():
+            raise TrainingDivergedError(
+                f"policies: the loss of seed {seeds[int(broken.argmax())]} is not finite after epoch {epoch}; "
+                f"try a lower policy.lr than {settings.lr:g}"
+            )
         points.append(_points(seeds, epoch, values))
         if log:
+            means = {split: metrics.mean(axis=1).tolist() for split, metrics in values.items()}
             log(
                 epoch,
                 {
-                    f"{split}/{metric}": float(each.mean())
-                    for split, metrics in values.items()
-                    for metric, each in zip(METRICS, metrics, strict=True)
+                    f"{split}/{metric}": mean
+                    for split in means
+                    for metric, mean in zip(METRICS, means[split], strict=True)
                 },
             )
         if progress:
             progress(epoch, settings.epochs)
 
-    with _one_thread():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
         ensemble = PolicyEnsemble(seeds, settings, data, after_epoch)
-        _fit(ensemble, settings, math.ceil(len(data.x) / settings.batch), device)
+        with trainer(
+            torch.device(device),
+            settings.epochs,
+            f"{len(seeds)} policies at batch {settings.batch}",
+            "lower --policy.batch or --policy_seeds, or end what else runs there",
+        ) as lightning_trainer:
+            lightning_trainer.fit(ensemble, train_dataloaders=range(math.ceil(len(data.x) / settings.batch)))
         steering, logits = ensemble.outputs(data.views["test"][0])
+    finally:
+        torch.set_num_threads(threads)
     return TrainedPolicies(
         weights=ensemble.weights() | scaling,
         curves=pd.concat(points, ignore_index=True)[list(CURVE_COLUMNS)],
@@ -109,30 +119,21 @@ def join_policies(shares: Sequence[TrainedPolicies]) -> TrainedPolicies:
 
     `seconds` is the sum over the shares.
     """
-    first = shares[0]
     curves = pd.concat([share.curves for share in shares], ignore_index=True)
-    ranks = {name: curves[name].map({each: rank for rank, each in enumerate(order)}) for name, order in ORDER.items()}
-    order = np.lexsort((ranks["metric"], ranks["split"], curves["epoch"]))  # stable: seeds stay in order
+    split, metric = (
+        pd.Index(order).get_indexer(pd.Index(curves[name])) for name, order in (("split", SPLITS), ("metric", METRICS))
+    )
+    order = np.lexsort((metric, split, curves["epoch"]))  # stable: seeds stay in order
     return TrainedPolicies(
         weights={
             name: value if name.startswith("z_") else np.concatenate([share.weights[name] for share in shares])
-            for name, value in first.weights.items()
+            for name, value in shares[0].weights.items()
         },
         curves=curves.iloc[order].reset_index(drop=True),
         acceleration=np.concatenate([share.acceleration for share in shares]),
         steering=np.concatenate([share.steering for share in shares]),
         seconds=sum(share.seconds for share in shares),
     )
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _check(
@@ -150,11 +151,12 @@ def _check(
             raise BadInputError(f"{split} latents are {z.dtype} {list(z.shape)}; float32 [frames, {LATENT}] is needed")
         if not np.isfinite(z).all():
             raise BadInputError(f"{split} latents hold values that are not finite; train the encoder again")
-        for column in ("steering", "acceleration"):
-            values = np.asarray(labels[column])
-            if values.shape != (len(z),) or not np.isfinite(values).all():
-                raise BadInputError(f"{split} labels '{column}' must be {len(z)} finite numbers, one for each latent")
-        if not np.isin(labels["acceleration"], range(len(ACCELERATIONS))).all():
+        values = labels[["steering", "acceleration"]].to_numpy(np.float64)
+        if len(values) != len(z) or not np.isfinite(values).all():
+            raise BadInputError(
+                f"{split} labels must be {len(z)} finite steerings and accelerations, as many as latents"
+            )
+        if not np.isin(values[:, 1], range(len(ACCELERATIONS))).all():
             raise BadInputError(f"{split} labels 'acceleration' must be classes 0 to {len(ACCELERATIONS) - 1}")
     if settings.batch > len(z_train):
         raise BadInputError(
@@ -164,24 +166,22 @@ def _check(
 
 
 def _policy_data(scaling: Arrays, train: Labelled, test: Labelled, device: torch.device) -> PolicyData:
-    (x_train, y_train), (x_test, y_test) = (
-        (
-            torch.from_numpy(normalise(scaling, z)).to(device),
-            Labels(
-                torch.from_numpy(np.array(labels["steering"], np.float32)).to(device),
-                torch.from_numpy(np.array(labels["acceleration"], np.int64)).to(device),
-            ),
+    def on_device(z: NDArray[np.float32], labels: pd.DataFrame) -> tuple[Tensor, Labels]:
+        commands = labels["steering"].to_numpy(np.float32), labels["acceleration"].to_numpy(np.int64)
+        return torch.from_numpy(normalise(scaling, z)).to(device), Labels(
+            *(torch.tensor(c).to(device) for c in commands)
         )
-        for z, labels in (train, test)
+
+    (x_train, y_train), view = on_device(*train), on_device(*test)
+    drawn = np.random.default_rng(SUBSET).permutation(len(x_train))[: len(view[0])]
+    part = torch.from_numpy(np.sort(drawn)).to(device)
+    return PolicyData(
+        x_train, y_train, {"train": (x_train[part], Labels(*(values[part] for values in y_train))), "test": view}
     )
-    some = np.random.default_rng(SUBSET).permutation(len(x_train))[: len(x_test)]
-    part = torch.from_numpy(np.sort(some)).to(device)
-    seen = (x_train[part], Labels(*(values[part] for values in y_train)))
-    return PolicyData(x_train, y_train, {"train": seen, "test": (x_test, y_test)})
 
 
 def _points(seeds: Sequence[int], epoch: int, values: dict[str, NDArray[Any]]) -> pd.DataFrame:
-    """Rows of the tidy table for one epoch."""
+    """Return the rows of the tidy table for one epoch."""
     index = pd.MultiIndex.from_product([values, METRICS, seeds], names=["split", "metric", "policy_seed"])
     numbers = np.concatenate([metrics.reshape(-1) for metrics in values.values()])
     return (
@@ -189,16 +189,3 @@ def _points(seeds: Sequence[int], epoch: int, values: dict[str, NDArray[Any]]) -
         .reset_index()
         .assign(stage="policy", epoch=epoch)
     )
-
-
-def _fit(ensemble: PolicyEnsemble, settings: PolicySettings, steps: int, device: str) -> None:
-    with trainer(
-        torch.device(device),
-        settings.epochs,
-        f"{len(ensemble.seeds)} policies at batch {settings.batch}",
-        "lower --policy.batch or --policy_seeds, or end what else runs there",
-    ) as lightning_trainer:
-        lightning_trainer.fit(ensemble, train_dataloaders=range(steps))
-
-
-ORDER = {"split": SPLITS, "metric": METRICS}  # of the rows of an epoch's curves
