@@ -39,7 +39,7 @@ def drive(seed: int, steps: int, **settings: object) -> Drive:
             ran_red += int((over & (light == RED)).sum())
         before = (front, road.fleet.move.copy(), np.array(agents))
         decisions = road.decisions
-        rows.append((decisions.acceleration, decisions.steering, speed, decisions.lateral, np.array(agents)))
+        rows.append((decisions.acceleration, decisions.steering, speed, road.fleet.lateral.copy(), np.array(agents)))
         road.step(DT)
     return Drive(*(np.array(values) for values in zip(*rows, strict=True)), road, ran_red)
 

@@ -18,7 +18,7 @@ SMALL = TownSettings(rows=3, columns=3, dropped_edges=0, vehicles=12)
 
 
 def test_gymnasiums_own_check_passes_without_a_warning() -> None:
-    env = gym.make("study/Town-v0", config={"town": SMALL})
+    env = gym.make("study.sim.register:study/Town-v0", config={"town": SMALL})
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(env.unwrapped, skip_render_check=True)

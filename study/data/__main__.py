@@ -5,14 +5,12 @@ Drives and frames carry their key in their path, so what is there is used again.
 python -m study.data build --profile laptop
 python -m study.data card
 python -m study.data preview
-python -m study.data scenes --out scenes --episodes 30
-python -m study.data import scenes
+python -m study.data import DIR
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -35,25 +33,18 @@ def parser() -> Parser:
     made = Parser(
         prog="study.data",
         usage="python -m study.data {record,build,card,preview} [--profile P] [--data FOLDER] [--group.setting V ...]\n"
-        "       python -m study.data import DIR [--out FOLDER]\n"
-        "       python -m study.data scenes [--out FOLDER] [--episodes N]",
+        "       python -m study.data import DIR [--out FOLDER]",
         description="Make the data of a study, describe it, and show it.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog="record   record the drives alone: they are small, and can be rendered on another machine\n"
         "build    record the drives and render the frames, whatever of them is missing\n"
         "card     what is in the data: PNG and text beside the frame store\n"
         "preview  pictures of frames, and an animated drive, beside the frame store\n"
-        "import   check and adapt the Episodes in DIR, so that 'study.sweep NAME --data FOLDER' can use them\n"
-        "scenes   record highway-env's intersection, roundabout and merge as Episodes, to be imported",
+        "import   check and adapt the Episodes in DIR, so that 'study.sweep NAME --data FOLDER' can use them",
     )
-    made.add_argument(
-        "action", choices=("record", "build", "card", "preview", "import", "scenes"), help="what to do (below)"
-    )
+    made.add_argument("action", choices=("record", "build", "card", "preview", "import"), help="what to do (below)")
     made.add_argument("folder", nargs="?", metavar="DIR", type=Path, help="import: where the Episodes are")
-    made.add_argument(
-        "--out", type=Path, metavar="FOLDER", help="import: default data/imported/<DIR's name>; scenes: data/scenes"
-    )
-    made.add_argument("--episodes", type=int, default=30, metavar="N", help="scenes: drives in all (default: 30)")
+    made.add_argument("--out", type=Path, metavar="FOLDER", help="import: default data/imported/<DIR's name>")
     made.add_argument(
         "--profile", default="laptop", help=f"{', '.join(named_files(SWEEPS / 'profiles'))} (default: laptop)"
     )
@@ -76,13 +67,6 @@ def main(args: Sequence[str]) -> int:
         made = import_drives(options.folder, options.out or DATA / "imported" / options.folder.resolve().name)
         print(describe(made))
         print(made.folder)
-        return 0
-    if options.action == "scenes":
-        from study.sim.scenes import record_scenes  # noqa: PLC0415
-
-        folder = options.out or DATA / "scenes"
-        record_scenes(folder, options.episodes, progress=_count)
-        print(folder)
         return 0
     settings = load_profile(options.profile, study_overrides(options))
     if options.workers < 1:
@@ -127,10 +111,6 @@ def _show(action: str, folder: Path, drives_at: Path) -> None:
 
         files = write_preview(store, drives, folder)
     print(*files, sep="\n")
-
-
-def _count(done: int, whole: int) -> None:
-    print(f"{done} of {whole} drives", file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""The expert: planned routes and the CARLA autopilot's rule (PAPER.md 2.6), for all vehicles of a town at once.
+"""The expert: planned routes and the CARLA autopilot's rule (docs/paper.md 2.6), for all vehicles of a town at once.
 
-N vehicles; arrays have one entry for each. Everything is computed for the whole fleet with numpy, because a step of a
-hundred vehicles is then hardly dearer than a step of one. Distances along a route are measured at the vehicle's
-centre; gaps and distances to a stop line from the front bumper.
+Arrays have one entry for each of N vehicles: with numpy, a step of a hundred vehicles costs hardly more than a step of
+one. Distances along a route are measured at the vehicle's centre; gaps and distances to a stop line from the front
+bumper.
 """
 
 from __future__ import annotations
@@ -19,34 +19,33 @@ from study.sim.town import Town
 
 DT = 0.1  # [s]
 STEERING_UNIT = 2.4  # wheel angle [rad] of a steering label of one
-THROTTLE = {0.5: 1.0, 1.0: 2.5}  # [m/s2] at rest, fading with speed
-TOP_SPEED = 25.0  # where the throttle has faded to nothing [m/s]
+THROTTLE = {0.5: 1.0, 1.0: 2.5}  # acceleration at rest, which falls with speed [m/s2]
+TOP_SPEED = 25.0  # at which throttle no longer accelerates [m/s]
 BRAKE = 5.0  # [m/s2]
-LOOK = 30.0  # how far ahead a vehicle on the route is noticed [m]
-REACH = LOOK + 8.0  # from centre to centre, so that nobody in the look-ahead is missed [m]
-MARGIN = 0.1  # added on both sides of the vehicle when its way is tested [m]
+LOOK = 30.0  # look-ahead for vehicles on the route [m]
+REACH = LOOK + 8.0  # distance between centres within which lie all vehicles of the look-ahead [m]
+MARGIN = 0.1  # added on both sides of a vehicle when its path is tested [m]
 
 KP_LATERAL, KP_HEADING = 1 / 0.6, 1 / 0.2  # gains of highway-env's steering control [1/s]
-SLOWEST = 3.0  # steering control divides by the speed: standing cars would turn their wheels wildly [m/s]
+SLOWEST = 3.0  # steering control divides by at least this speed, or standing cars would turn their wheels wildly [m/s]
 MOST_STEERING = np.pi / 3  # [rad]
 
-SPACING = 0.5  # of the samples of a planned way [m]
-SAMPLES = 512  # kept of each vehicle's way
-AHEAD, BEHIND = 70.0, 10.0  # of the vehicle, at least kept [m]
+SPACING = 0.5  # between the samples of a planned path [m]
+SAMPLES = 512  # kept of each vehicle's path
+AHEAD, BEHIND = 70.0, 10.0  # length of path that is kept at least, before and behind the vehicle [m]
 GAP = 7.5  # of street that a waiting vehicle takes [m]
 AT_LINE = 5.0  # a vehicle this near to its stop line is the first of its queue [m]
-NEVER = 2**62  # a step that does not come
-GAP_MARGIN = 0.8  # a turning vehicle leaves the crossing lane so long before the other arrives [s]
+NEVER = 2**62  # a step beyond every drive
+GAP_MARGIN = 0.8  # by which a turning vehicle leaves the crossing lane before the other arrives [s]
 
 
 @dataclass(frozen=True)
 class Decisions:
-    """What every vehicle did in one step and what it saw when it decided; [N] arrays.
+    """The command of every vehicle in one step, and what it was based on; [N] arrays.
 
     `steering`: label, wheel angle over STEERING_UNIT, positive to the left. `acceleration`: one of ACCELERATIONS.
     `light`: next signal on the route, -1 for none. `light_distance`: centre to its stop line along the route [m].
     `lead_gap`: free way from the front bumper along the route [m], inf where nothing is within LOOK.
-    `lateral`, `heading_error`: from the planned way, to the right [m, rad]; `curvature` of the way [1/m].
     """
 
     steering: Floats
@@ -55,23 +54,20 @@ class Decisions:
     light_distance: Floats
     route_s: Floats
     lead_gap: Floats
-    lateral: Floats
-    heading_error: Floats
-    curvature: Floats
 
 
 class Fleet:
-    """The autopilot's memory: where every vehicle is on its planned route, and what it has made up its mind to."""
+    """The state of the autopilot: where every vehicle is on its planned route, and its decisions in force."""
 
     def __init__(self, town: Town, vehicles: int, brake_hold: float, rng: np.random.Generator) -> None:
         self.town, self.rng = town, rng
         self.hold_steps = round(brake_hold / DT)
         self.limits = np.array([strip.limit for strip in town.strips])
-        self.starts: list[list[float]] = [[] for _ in range(vehicles)]  # along the route, of its strips
+        self.starts: list[list[float]] = [[] for _ in range(vehicles)]  # of the route's strips, along it
         self.routes: list[list[int]] = [[] for _ in range(vehicles)]  # strips
         self.turns: list[list[tuple[int, float]]] = [[] for _ in range(vehicles)]  # signalled movements ahead
         self.ends = np.zeros(vehicles)  # of the planned route
-        self.sampled = np.zeros(vehicles, np.int64)  # strips of the route that are in `x` and so on
+        self.sampled = np.zeros(vehicles, np.int64)  # strips of the route that `x` and so on hold
         self.x, self.y, self.heading, self.curvature = np.zeros((4, vehicles, SAMPLES))
         self.first = np.zeros(vehicles, np.int64)  # number along the route of the first sample kept
         self.filled = np.zeros(vehicles, np.int64)  # samples kept
@@ -83,9 +79,9 @@ class Fleet:
         self.move = np.full(vehicles, -1)  # next or present signalled movement, -1 for none
         self.move_start, self.move_end = np.full((2, vehicles), np.inf)
         self.stopping = np.zeros(vehicles, bool)  # for the light ahead
-        self.running = np.zeros(vehicles, bool)  # a yellow that came too late
-        self.held = np.zeros(vehicles, bool)  # before a junction that has no room behind it
-        self.denied = np.full(vehicles, NEVER)  # step at which that first kept it from using its green
+        self.running = np.zeros(vehicles, bool)  # through a yellow that came too late to stop
+        self.held = np.zeros(vehicles, bool)  # before a junction whose exit is full
+        self.denied = np.full(vehicles, NEVER)  # step at which that first kept the vehicle from using its green
         self.since = np.zeros(vehicles, np.int64)  # step at which the junction was entered
         self.braking = np.zeros(vehicles, bool)
         self.brake_until = np.zeros(vehicles, np.int64)
@@ -95,7 +91,7 @@ class Fleet:
         self.move_signal = np.array([town.signal_of[move.entry] for move in moves], np.int64)
         self.move_length = np.array([move.length for move in moves])
         self.street_length = np.array([strip.piece.length for strip in town.strips])
-        self.load = np.zeros(len(town.strips))  # vehicles that are on a strip or plan to come
+        self.load = np.zeros(len(town.strips))  # vehicles that are on a strip or plan to use it
         across = np.where(town.opposing, town.enter, np.inf)
         self.first_crossing = np.nan_to_num(across, nan=np.inf).min(axis=1, initial=np.inf)
 
@@ -103,8 +99,8 @@ class Fleet:
 
     def place(self, slot: int, strip: int, s: float) -> None:
         """Give a vehicle a new route that starts on a street's strip, with the vehicle at `s` [m] of it."""
-        for gone in self.routes[slot][int(self.at[slot]) :]:
-            self.load[gone] -= 1
+        for old in self.routes[slot][int(self.at[slot]) :]:
+            self.load[old] -= 1
         self.routes[slot], self.starts[slot], self.turns[slot] = [], [], []
         self.ends[slot] = self.sampled[slot] = self.first[slot] = self.filled[slot] = self.at[slot] = 0
         self.s[slot], self.lateral[slot] = s, 0.0
@@ -124,7 +120,7 @@ class Fleet:
         self.load[strip] += 1
 
     def _lengthen(self, slot: int) -> None:
-        """Plan further where the plan gets short, and sample the way as far as it may be looked at."""
+        """Extend a route that gets short, and sample the path as far as the look-ahead needs."""
         signalled = bool(self.town.signals)
         while self.ends[slot] < self.s[slot] + AHEAD + 60 or (signalled and len(self.turns[slot]) < 2):
             number = self._choose(self.town.ways[self.routes[slot][-1]])
@@ -145,7 +141,7 @@ class Fleet:
             self.sampled[slot] += 1
 
     def _choose(self, ways: tuple[int, ...]) -> int:
-        """A turn at random; full streets are avoided, or rings of them would lock for ever."""
+        """Return a random movement; full streets are avoided, since rings of them would lock for ever."""
         exits = self.move_exit[list(ways)]
         free = np.maximum(1 - self.load[exits] * GAP / self.street_length[exits], 0.02) ** 2
         return ways[int(np.searchsorted(np.cumsum(free), self.rng.random() * free.sum()))]
@@ -156,7 +152,7 @@ class Fleet:
         begin = int(self.first[slot]) + filled
         count = max(int(np.ceil((start + piece.length) / SPACING)) - begin, 0)
         x, y, heading = piece.at(np.arange(begin, begin + count, dtype=np.float64) * SPACING - start)
-        if filled:  # headings go on without jumps, so that they can be interpolated
+        if filled:  # headings continue without jumps, so that they can be interpolated
             heading = heading + 2 * np.pi * round((self.heading[slot, filled - 1] - piece.heading) / (2 * np.pi))
         new = slice(filled, filled + count)
         self.x[slot, new], self.y[slot, new], self.heading[slot, new] = x, y, heading
@@ -167,7 +163,7 @@ class Fleet:
         at = int(self.at[slot])
         self.strip[slot] = self.routes[slot][at]
         self.strip_start[slot] = self.starts[slot][at]
-        # Not the next strip's start: the way may not be planned that far yet.
+        # Not the next strip's start: the route may not be planned that far yet.
         self.strip_end[slot] = self.starts[slot][at] + self.street_length[self.routes[slot][at]]
 
     def _next_turn(self, slot: int) -> None:
@@ -177,7 +173,7 @@ class Fleet:
             self.move_end[slot] = start + self.move_length[number]
 
     def follow(self, x: Floats, y: Floats) -> None:
-        """Find every vehicle on its planned way, and plan ahead."""
+        """Locate every vehicle on its planned path, and plan ahead."""
         rows = np.arange(len(x))
         near = (self.s / SPACING).astype(np.int64) - self.first
         window = (near[:, None] + np.arange(-3, 7)).clip(0)
@@ -201,7 +197,7 @@ class Fleet:
             self._lengthen(slot)
 
     def ahead(self, values: Floats, distance: Floats) -> Floats:
-        """A sampled quantity, interpolated at `distance` [m] ahead."""
+        """Return a sampled quantity, interpolated at `distance` [m] ahead."""
         rows = np.arange(len(distance))
         place = (self.s + distance) / SPACING - self.first
         k = np.floor(place).astype(np.int64)
@@ -217,7 +213,7 @@ class Fleet:
         pairs: tuple[Ints, Ints],
         lights: NDArray[np.uint8],
     ) -> Decisions:
-        """Every vehicle's command from `pose` (x, y, heading, speed) after `follow`.
+        """Return every vehicle's command from `pose` (x, y, heading, speed) after `follow`.
 
         `pairs`: each (i, j), sorted, of vehicles within at least REACH of each other; `lights`: states of the signals.
         """
@@ -231,15 +227,14 @@ class Fleet:
         limit = self.limits[self.strip] * 3.6
         ray = np.maximum(0.5, kmh * kmh / 100) + 2
         brake = (kmh >= limit) | self.stopping | (gap < ray)
-        self.brake_until[brake & ~self.braking] = step + self.hold_steps  # from its start, not for as long as it lasts
+        self.brake_until[brake & ~self.braking] = step + self.hold_steps  # from the brake's first step on
         brake |= step < self.brake_until
         self.braking = brake
         low, middle, high = ACCELERATIONS
         acceleration = np.where(brake, low, np.where(kmh >= limit - 10, middle, high))
-        error, curvature, wheel = self._steer(heading, speed)
         known = (self.move >= 0) & (self.s <= self.move_start)
         return Decisions(
-            steering=-wheel / STEERING_UNIT,
+            steering=-self._steer(heading, speed) / STEERING_UNIT,
             acceleration=acceleration,
             light=np.where(known, self.move_signal[self.move], -1)
             if len(self.move_signal)
@@ -247,13 +242,10 @@ class Fleet:
             light_distance=np.where(known, self.move_start - self.s, np.nan),
             route_s=self.s.copy(),
             lead_gap=lead_gap,
-            lateral=self.lateral.copy(),
-            heading_error=error,
-            curvature=curvature,
         )
 
-    def _steer(self, heading: Floats, speed: Floats) -> tuple[Floats, Floats, Floats]:
-        """highway-env's cascade of lateral and heading control, with the way's curvature fed forward."""
+    def _steer(self, heading: Floats, speed: Floats) -> Floats:
+        """Return wheel angles by highway-env's cascade of lateral and heading control, with curvature fed forward."""
         v = np.maximum(speed, SLOWEST)
         curvature = self.ahead(self.curvature, speed * DT)
         course = self.ahead(self.heading, speed * DT) - np.arcsin(curvature * LENGTH / 2)  # the body points inwards
@@ -261,11 +253,11 @@ class Fleet:
         error = np.mod(course + aside - heading + np.pi, 2 * np.pi) - np.pi
         rate = v * curvature + KP_HEADING * error
         slip = np.arcsin((LENGTH / 2 / v * rate).clip(-1, 1))
-        wheel = np.arctan(2 * np.tan(slip)).clip(-MOST_STEERING, MOST_STEERING)
-        return error, curvature, wheel
+        wheel: Floats = np.arctan(2 * np.tan(slip)).clip(-MOST_STEERING, MOST_STEERING)
+        return wheel
 
     def _lead(self, pose: Pose, pairs: tuple[Ints, Ints]) -> tuple[Floats, Ints]:
-        """Free way before each bumper [m], inf beyond LOOK, and who ends it (-1: nobody)."""
+        """Return the free way before each bumper [m], inf beyond LOOK, and the vehicle that ends it, -1 for none."""
         x, y, heading, _ = pose
         i, j = pairs
         near = np.floor(self.s / SPACING).astype(np.int64) - self.first
@@ -299,14 +291,14 @@ class Fleet:
         return gap, lead
 
     def _heed_lights(self, front: Floats, speed: Floats, lights: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Make up or keep each mind about the light ahead; returns the state that each vehicle faces."""
+        """Decide whether to stop for the light ahead, and return the state that each vehicle faces."""
         state = np.full(len(front), GREEN, np.uint8)
         ruled = self.move >= 0
         state[ruled] = lights[self.move_signal[self.move[ruled]]]
         before = ruled & (front <= 0)
         bound = before & (state != GREEN)
         way = speed * speed / (2 * BRAKE)
-        late = bound & (-front < way + DT * speed)  # cannot stop any more
+        late = bound & (-front < way + DT * speed)  # too late to stop
         heeded = bound & (-front <= way + 0.2 * speed + 2.5)
         self.running = late & ~self.stopping & ((state == YELLOW) | self.running)
         self.stopping = (self.stopping & bound) | (heeded & ~self.running)
@@ -315,7 +307,7 @@ class Fleet:
     def _right_of_way(
         self, step: int, front: Floats, speed: Floats, state: NDArray[np.uint8], lead_gap: Floats, lead: Ints
     ) -> Floats:
-        """Distance from each bumper to where the vehicle has to let others pass [m], inf where it need not."""
+        """Return the distance from each bumper to where the vehicle must let others pass [m], inf where it need not."""
         town, gap = self.town, np.full(len(front), np.inf)
         if not len(self.move_length):
             return gap
@@ -325,8 +317,8 @@ class Fleet:
         waits = (self.move >= 0) & (front > -45)
         one, other = np.flatnonzero(waits), np.flatnonzero(waits & goes)
         table = town.enter[self.move[one][:, None], self.move[other][None]]
-        found = np.nonzero(~np.isnan(table))
-        i, j = one[found[0]], other[found[1]]
+        rows, columns = np.nonzero(~np.isnan(table))
+        i, j = one[rows], other[columns]
         a, b = self.move[i], self.move[j]
         into_i, out_i, into_j, out_j = town.enter[a, b], town.leave[a, b], town.enter[b, a], town.leave[b, a]
         open_ = (front[i] - LENGTH < out_i) & (front[j] - LENGTH < out_j) & (front[i] <= into_i)
@@ -334,14 +326,14 @@ class Fleet:
         taken = (front[j] > begun) & open_
         across = town.opposing[a, b]
         yields = across & self.move_left[a] & ~self.move_left[b]
-        # across: the left turn waits for whoever can be there before it is through
+        # From across: a left turn waits for vehicles that can arrive before it is through.
         stuck = (lead[j] >= 0) & (lead_gap[j] < into_j - front[j]) & (speed[lead[j]] < 2)
         soon = _time(into_j - front[j], speed[j], 2.5, 12.0) < GAP_MARGIN + _time(
             out_i + LENGTH - front[i], speed[i], 1.7, 9.0
         )
         crossing = self.first_crossing[a]
         turn = yields & (front[i] <= crossing) & (taken | (open_ & soon & ~stuck))
-        # from the side: who is inside goes first, the others wait behind their stop line
+        # From the side: vehicles inside the junction go first, the others wait behind their stop line.
         older = ~across & open_ & (inside[j] | self.running[j])
         line = older & ~inside[i]
         rank = (self.since[j] < self.since[i]) | ((self.since[j] == self.since[i]) & (j < i))
@@ -351,10 +343,10 @@ class Fleet:
         return gap
 
     def _room_behind(self, step: int, front: Floats, speed: Floats, state: NDArray[np.uint8]) -> Floats:
-        """Distance to the stop line [m] for those whose street behind the junction is full, inf for the others.
+        """Return the distance to the stop line [m] where the street behind the junction is full, inf elsewhere.
 
-        Who could not enter at green goes before others into the same street; or the rhythm of two junctions may let
-        one approach fill it, green after green, and keep another waiting.
+        A vehicle that could not enter at green goes before others into the same street; else the cycles of two
+        junctions may let one approach fill it at every green, and keep another waiting.
         """
         room = self.street_length.copy()
         np.minimum.at(room, self.strip, self.s - self.strip_start - LENGTH / 2 + speed * speed / (2 * BRAKE))
@@ -377,7 +369,7 @@ class Fleet:
 
 
 def _time(distance: Floats, speed: Floats, acceleration: float, top: float) -> Floats:
-    """Time to cover a distance when accelerating up to the top speed [s]; 0 for a distance behind."""
+    """Return the time to cover a distance when accelerating up to the top speed [s]; 0 for a distance behind."""
     distance, speed = np.maximum(distance, 0), np.minimum(speed, top)
     ramp = (top - speed) / acceleration
     on_ramp = (speed + top) / 2 * ramp

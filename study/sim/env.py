@@ -1,11 +1,10 @@
-"""TownEnv: the town as a gymnasium environment on highway-env, registered as `study/Town-v0` (Sec. IV-A)."""
+"""TownEnv: the town as a gymnasium environment on highway-env (Sec. IV-A)."""
 
 from __future__ import annotations
 
 import math
 from typing import Any, SupportsFloat
 
-import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from highway_env.envs.common.abstract import AbstractEnv
@@ -34,16 +33,16 @@ from study.sim.road import TownNetwork, TownRoad, TownVehicle
 from study.sim.town import Town, draw_town
 
 EGO = 0  # position of the ego among the vehicles
-APART = 14.0  # vehicles start at least so far from each other [m]
-APART_LATER = 25.0  # and enter at least so far from others on their way, if there is such a place [m]
-SPOTS = 200  # drawn, of which the first good one is taken
+APART = 14.0  # smallest distance between vehicles at the start [m]
+APART_LATER = 25.0  # and from a vehicle that enters later to the others, where there is such a place [m]
+SPOTS = 200  # drawn for each vehicle, which takes the first good one
 START_SPEED = 5.0  # [m/s]
-OFF_ROUTE = 4.0  # an ego farther than this from its way has lost it [m]
-CURVATURES = (5.0, 10.0, 20.0)  # where the ego looks at its way [m]
+OFF_ROUTE = 4.0  # an ego farther than this from its path has left it [m]
+CURVATURES = (5.0, 10.0, 20.0)  # distances at which the ego observes the curvature of its path [m]
 
 
 class Traffic(TownRoad):
-    """The town's road with its lights and its autopilot: decides for everybody, then lets highway-env move them."""
+    """The town's road with lights and autopilot: decides for all vehicles, then moves them with highway-env."""
 
     def __init__(
         self, town: Town, settings: TownSettings, rng: np.random.Generator, *, fast: bool, lights: LightPlan
@@ -52,7 +51,7 @@ class Traffic(TownRoad):
         self.town, self.lights = town, lights
         self.fleet = Fleet(town, settings.vehicles, settings.brake_hold, rng)
         self.steps = 0
-        self.agents: list[int] = []  # of each vehicle; one that is taken away and its successor differ
+        self.agents: list[int] = []  # of each vehicle; a vehicle that replaces another has a new number
         self.commands: dict[int, tuple[float, float]] = {}  # vehicle -> (acceleration, steering) for this step
         self.crashed: list[int] = []  # vehicles that collided in the last step, by now replaced
         self.collided = 0  # vehicles since the start
@@ -69,11 +68,11 @@ class Traffic(TownRoad):
 
     @property
     def time(self) -> float:
-        """Seconds since the start."""
+        """Return the seconds since the start."""
         return self.steps * DT
 
     def _enter(self, slot: int) -> None:
-        """Put a new vehicle on a free spot of some street, in place of the one in `slot`, if there is one."""
+        """Put a new vehicle on a free spot of some street, in place of the one in `slot`, if any."""
         others = np.array([v.position for k, v in enumerate(self.vehicles) if k != slot]).reshape(-1, 2)
         strips = self.np_random.choice(self.streets, SPOTS)
         room = np.maximum(self.lengths[strips] - APART - LENGTH, 1.0)  # not right before a stop line
@@ -97,7 +96,7 @@ class Traffic(TownRoad):
         self.fleet.follow(x, y)
 
     def act(self) -> None:
-        """Decide every vehicle's command; one in `commands` has it from there."""
+        """Decide the command of every vehicle; one in `commands` takes it from there."""
         pose = self.pose()
         self.light_states = self.lights.states(self.time)
         decisions = self.fleet.decide(self.steps, pose, self.pairs_within(REACH, pose), self.light_states)
@@ -112,14 +111,14 @@ class Traffic(TownRoad):
             push * (1 - speed / TOP_SPEED),
         )
         wheel = -decisions.steering * STEERING_UNIT
-        for vehicle, one, other in zip(self.vehicles, force.tolist(), wheel.tolist(), strict=True):
-            vehicle.act({"acceleration": one, "steering": other})
+        for vehicle, acceleration, steering in zip(self.vehicles, force.tolist(), wheel.tolist(), strict=True):
+            vehicle.act({"acceleration": acceleration, "steering": steering})
 
     def step(self, dt: float) -> None:
-        """Move everybody by `dt`; whoever has crashed is taken away and a new vehicle enters elsewhere."""
+        """Move all vehicles by `dt` [s]; a new vehicle replaces each that has crashed, elsewhere."""
         super().step(dt)
         self.steps += 1
-        # highway-env crashes vehicles that will overlap after one more step in that next step: it has happened
+        # highway-env marks vehicles that will overlap after one more step; they count as crashed now
         self.crashed = [k for k, vehicle in enumerate(self.vehicles) if vehicle.crashed or vehicle.impact is not None]
         self.collided += len(self.crashed)
         for slot in self.crashed:
@@ -131,13 +130,13 @@ class TownAction(ActionType):
     """The ego's command: position in ACCELERATIONS, and a steering label in the autopilot's unit."""
 
     def space(self) -> spaces.Space[Any]:
-        """Class of acceleration, and steering (positive to the left; 0.25 is the paper's crop)."""
+        """Return the space: class of acceleration, and steering (positive to the left; 0.25 is the paper's crop)."""
         most = MOST_STEERING / STEERING_UNIT
         return spaces.Tuple((spaces.Discrete(len(ACCELERATIONS)), spaces.Box(-most, most, (1,), np.float32)))
 
     @property
     def vehicle_class(self) -> type[TownVehicle]:
-        """The class of the ego."""
+        """Return the class of the ego."""
         return TownVehicle
 
     def act(self, action: tuple[int, np.ndarray[Any, Any]]) -> None:
@@ -147,18 +146,18 @@ class TownAction(ActionType):
 
 
 class TownObservation(ObservationType):
-    """What the ego's autopilot knows, as a vector."""
+    """The inputs of the ego's autopilot, as a vector."""
 
     # speed, limit, lateral and heading error, curvatures ahead, light's distance and whether it is green, free way
     HIGH = np.array([40, 40, 20, np.pi, *[1] * len(CURVATURES), LOOK, 1, LOOK], np.float32)
     LOW = np.array([-1, 0, -20, -np.pi, *[-1] * len(CURVATURES), 0, 0, -LENGTH], np.float32)
 
     def space(self) -> spaces.Space[Any]:
-        """In m, m/s, rad and 1/m; to the right is positive."""
+        """Return the space in m, m/s, rad and 1/m; to the right is positive."""
         return spaces.Box(self.LOW, self.HIGH, dtype=np.float32)
 
     def observe(self) -> np.ndarray[Any, Any]:
-        """The vector after the last step."""
+        """Return the vector after the last step."""
         road: Traffic = self.env.road
         fleet, vehicle = road.fleet, road.vehicles[EGO]
         move = int(fleet.move[EGO])
@@ -166,28 +165,28 @@ class TownObservation(ObservationType):
         if move >= 0 and fleet.s[EGO] <= fleet.move_start[EGO]:
             distance = min(float(fleet.move_start[EGO] - fleet.s[EGO]), LOOK)
             green = float(road.lights.states(road.time)[fleet.move_signal[move]] == GREEN)
-        way = [float(fleet.ahead(fleet.curvature, np.full(len(fleet.s), s))[EGO]) for s in CURVATURES]
+        bends = [float(fleet.ahead(fleet.curvature, np.full(len(fleet.s), s))[EGO]) for s in CURVATURES]
         course = float(fleet.ahead(fleet.heading, np.zeros(len(fleet.s)))[EGO])
         error = (course - vehicle.heading + np.pi) % (2 * np.pi) - np.pi
         gap = min(float(road.decisions.lead_gap[EGO]), LOOK) if road.steps else LOOK
         limit = float(fleet.limits[fleet.strip[EGO]])
-        values = [vehicle.speed, limit, fleet.lateral[EGO], error, *way, distance, green, gap]
-        seen: np.ndarray[Any, Any] = np.array(values, np.float32).clip(self.LOW, self.HIGH)
-        return seen
+        values = [vehicle.speed, limit, fleet.lateral[EGO], error, *bends, distance, green, gap]
+        vector: np.ndarray[Any, Any] = np.array(values, np.float32).clip(self.LOW, self.HIGH)
+        return vector
 
 
 class TownEnv(AbstractEnv):
-    """A town with its traffic at 10 Hz; the ego is one of the vehicles, and the autopilot drives the others.
+    """A town with its traffic at 10 Hz; the ego is one of the vehicles, the autopilot drives the others.
 
     An action is (class of acceleration, steering); `None` leaves the ego to the autopilot. The episode ends when the
-    ego collides or leaves its planned way. Config: `town` (TownSettings or a dict), `seed` (of a `reset` that names
-    none; None draws one), `duration` [s], `fast_lookups` (False: highway-env's own searches over everything). Raises
-    BadInputError for settings that cannot be met.
+    ego collides or leaves its planned path. Config: `town` (TownSettings or a dict), `seed` (of a `reset` without one;
+    None draws one), `duration` [s], `fast_lookups` (False: highway-env's own searches). Raises BadInputError for
+    settings that cannot be met.
     """
 
     @classmethod
     def default_config(cls) -> dict[str, Any]:
-        """highway-env's settings and ours."""
+        """Return highway-env's settings and ours."""
         config: dict[str, Any] = super().default_config()
         return config | {
             "town": TownSettings(),
@@ -202,7 +201,7 @@ class TownEnv(AbstractEnv):
         }
 
     def define_spaces(self) -> None:
-        """Our own action and observation."""
+        """Set our own action and observation spaces."""
         self.action_type = TownAction(self)
         self.observation_type = TownObservation(self)
         self.action_space = self.action_type.space()
@@ -228,7 +227,7 @@ class TownEnv(AbstractEnv):
         super()._simulate(action)
 
     def _reward(self, action: Any) -> SupportsFloat:
-        """Speed as a share of the limit; -1 for a collision."""
+        """Return the speed as a share of the limit, -1 for a collision."""
         del action
         if EGO in self.road.crashed:
             return -1.0
@@ -243,7 +242,7 @@ class TownEnv(AbstractEnv):
 
 
 def make_traffic(settings: TownSettings, seed: int, *, fast: bool = True) -> Traffic:
-    """A town, its lights and its vehicles, all drawn from the seed.
+    """Return a town with lights and vehicles, all drawn from the seed.
 
     Raises BadInputError when the settings cannot be met.
     """
@@ -256,7 +255,3 @@ def make_traffic(settings: TownSettings, seed: int, *, fast: bool = True) -> Tra
             f"take at most {int(room / APART / 2)} (vehicles) or a larger grid"
         )
     return Traffic(town, settings, traffic_rng, fast=fast, lights=plan_lights(town, settings, light_rng))
-
-
-if "study/Town-v0" not in gym.registry:
-    gym.register("study/Town-v0", entry_point="study.sim.env:TownEnv")

@@ -1,4 +1,4 @@
-"""Lane geometry: poses and the arcs and lines that connect them."""
+"""Geometry of lanes: poses, and the arcs and lines that connect them."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Piece:
     length: float
 
     def at(self, s: Floats) -> tuple[Floats, Floats, Floats]:
-        """Points and headings at the distances `s` [m] from the start."""
+        """Return points [m] and headings [rad] at the distances `s` [m] from the start."""
         heading = self.heading + self.curvature * s
         if self.curvature == 0:
             return self.x + s * math.cos(self.heading), self.y + s * math.sin(self.heading), heading
@@ -39,22 +39,22 @@ class Piece:
         return x, y, heading
 
     def end(self) -> tuple[float, float, float]:
-        """Pose at the end."""
+        """Return the pose of the end."""
         x, y, heading = self.at(np.array([self.length]))
         return float(x[0]), float(y[0]), float(heading[0])
 
     def moved(self, dx: float, dy: float) -> Piece:
-        """The same piece elsewhere."""
+        """Return the piece, shifted by (dx, dy) [m]."""
         return Piece(self.x + dx, self.y + dy, self.heading, self.curvature, self.length)
 
 
 def _direction(arm: int) -> tuple[float, float, float]:
-    """Unit vector and heading from a node into an arm; exact, so that streets lie exactly along the axes."""
+    """Return unit vector and heading from a node into an arm, exact, so that streets lie exactly along the axes."""
     return ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[arm] + ((0.0, 0.5, 1.0, -0.5)[arm] * math.pi,)
 
 
 def pose_at(arm: int, lane: int, reach: float, *, inbound: bool) -> tuple[float, float, float]:
-    """Where a lane of an arm meets a junction at the origin; lane 0 is next to the middle of the street."""
+    """Return the pose where a lane of an arm meets a junction at the origin; lane 0 is next to the street's middle."""
     x, y, heading = _direction((arm + 2) % 4 if inbound else arm)
     along = -reach if inbound else reach
     side = (lane + 0.5) * LANE_WIDTH
@@ -62,7 +62,7 @@ def pose_at(arm: int, lane: int, reach: float, *, inbound: bool) -> tuple[float,
 
 
 def connect_poses(start: tuple[float, float, float], end: tuple[float, float, float], turn: Turn) -> list[Piece]:
-    """Pieces between two poses: straight, an S of two arcs, or a quarter turn with a straight before or after it."""
+    """Return pieces between two poses: a straight, an S of two arcs, or a quarter turn with a straight on one side."""
     x, y, heading = start
     c, s = math.cos(heading), math.sin(heading)
     ahead = (end[0] - x) * c + (end[1] - y) * s

@@ -1,4 +1,4 @@
-"""A junction of the town: its turns, conflicts and borders."""
+"""Junctions of the town: turns, conflicts and borders."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ SLACK = 0.3  # vehicles do not follow their lines exactly [m]
 
 @dataclass(frozen=True)
 class Strip:
-    """A piece as a part of the map: which street or movement it belongs to, and what borders it has."""
+    """A piece as a part of the map: the street or movement it belongs to, its borders and speed limit."""
 
     piece: Piece
     index: LaneIndex
-    left: str  # borders in study.episode's words
+    left: str  # borders, one of study.episode.schema.BORDERS
     right: str
     junction: bool
     limit: float  # [m/s]
@@ -33,7 +33,7 @@ class Movement:
     """A way through a junction, from a street's lane (`entry`) over `strips` to another street's lane (`exit`)."""
 
     node: int
-    arm: int  # where it comes from: 0 east, 1 south, 2 west, 3 north of the node
+    arm: int  # side it comes from: 0 east, 1 south, 2 west, 3 north of the node
     turn: Turn
     entry: int
     exit: int
@@ -61,17 +61,17 @@ class Junction:
 
 
 def _lane_turns(lanes: int, turns: list[Turn], straight_lanes: int) -> list[list[Turn]]:
-    """Which turns each lane of an approach offers, lane 0 next to the middle; two lanes never merge in a junction."""
+    """Return the turns that each lane of an approach offers, lane 0 next to the middle; two lanes never merge."""
     if lanes == 1:
         return [turns]
-    if len(turns) == 2:  # at a T each lane has a use of its own
+    if len(turns) == 2:  # at a T junction each lane has its own turn
         return [turns[:1], turns[1:]]
     return [["left", "straight"] if straight_lanes == 2 else ["left"], ["straight", "right"]]
 
 
 @cache
 def draw_junction(arms: tuple[int, int, int, int], reach: float) -> Junction:
-    """All ways through a junction at the origin whose arms have so many lanes each way (0: no such arm)."""
+    """Return a junction at the origin whose arms have these numbers of lanes each way (0: no such arm)."""
     ways = []
     for arm, lanes in enumerate(arms):
         if not lanes:
@@ -95,19 +95,19 @@ def draw_junction(arms: tuple[int, int, int, int], reach: float) -> Junction:
 
 
 def _exit_lanes(turn: Turn, lane: int, lanes: int, to_lanes: int, *, ways: int) -> list[int]:
-    """Lanes that a turn of a lane leads to: any that no other vehicle of the same green may need.
+    """Return the lanes that a turn of a lane leads to: all that no other vehicle of the same green may need.
 
-    More than one, because nobody changes lanes on a street.
+    There is more than one, because no vehicle changes lanes on a street.
     """
     if ways == 1 or (ways == 3 and turn == "straight" and lanes == to_lanes):
         return [lane]
-    if ways == 3 and turn == "left":  # or left turns from across would meet
+    if ways == 3 and turn == "left":  # else left turns from across would meet
         return [0]
     return list(range(to_lanes))
 
 
 def _conflicts(ways: list[_Way]) -> tuple[Floats, Floats]:
-    """Where ways from different arms are in each other's way, as in `Town`."""
+    """Return where ways from different arms obstruct each other: `enter` and `leave` of `Town`."""
     enter = np.full((len(ways), len(ways)), np.nan)
     leave = enter.copy()
     bodies = [_bodies(way.pieces) for way in ways]
@@ -119,14 +119,14 @@ def _conflicts(ways: list[_Way]) -> tuple[Floats, Floats]:
             dy = discs_a[:, :, 1].reshape(-1, 1) - discs_b[:, :, 1].reshape(1, -1)
             near = dx * dx + dy * dy < (2 * COVER + SLACK) ** 2
             meet = near.reshape(len(s_a), len(DISCS), len(s_b), len(DISCS)).max(axis=(1, 3))
-            for one, other, s, own in ((a, b, s_a, meet.max(axis=1)), (b, a, s_b, meet.max(axis=0))):
-                if own.any():
-                    enter[one, other], leave[one, other] = s[own][0] + LENGTH / 2, s[own][-1] - LENGTH / 2
+            for one, other, s, meets in ((a, b, s_a, meet.max(axis=1)), (b, a, s_b, meet.max(axis=0))):
+                if meets.any():
+                    enter[one, other], leave[one, other] = s[meets][0] + LENGTH / 2, s[meets][-1] - LENGTH / 2
     return enter, leave
 
 
 def _bodies(pieces: tuple[Piece, ...]) -> tuple[Floats, Floats]:
-    """Where the discs of a vehicle on its way are, [P, 3, 2] m, and how far along its centre is then, [P] m."""
+    """Return the discs of a vehicle along its way, [P, 3, 2] m, and how far along its centre is then, [P] m."""
     discs, distances, done = [], [], 0.0
     for piece in pieces:
         s = np.linspace(0, piece.length, math.ceil(piece.length) + 1)
@@ -140,7 +140,7 @@ def _bodies(pieces: tuple[Piece, ...]) -> tuple[Floats, Floats]:
 
 
 def junction_borders(way: _Way, arms: list[int], *, bend: bool) -> tuple[str, str]:
-    """Borders of a way: the kerb on its right where nothing leaves there; lines only through bends."""
+    """Return the borders of a way: the kerb on its right where no other way leaves there; lines only in bends."""
     outer = way.lane == arms[way.arm] - 1 and way.to_lane == arms[way.to_arm] - 1
     kerb = outer and (way.turn == "right" or bend or (way.turn == "straight" and not arms[(way.arm + 3) % 4]))
     if not bend:

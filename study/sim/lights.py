@@ -1,4 +1,4 @@
-"""Traffic lights: a fixed plan for each junction, phase after phase green, yellow and all red."""
+"""Traffic lights: a fixed plan for each junction, in which each phase is green, yellow, then all red."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from study.sim.town import Town
 
 @dataclass(frozen=True)
 class LightPlan:
-    """When which light is green. L lights, as `Town.signals`.
+    """The times at which lights are green. L lights, as `Town.signals`.
 
     `start`: [L] s, when in its cycle a light turns green, with the junction's own shift. `cycle`: [L] s.
     """
@@ -25,8 +25,8 @@ class LightPlan:
     yellow: float
 
     def states(self, time: float) -> NDArray[np.uint8]:
-        """State of every light at `time` [s]: [L] uint8, GREEN, YELLOW or RED."""
-        # Times are sums of tenths: without the hair, 5.0 may come out as 4.999... and a light as 0.1 s late.
+        """Return the state of every light at `time` [s]: [L] uint8, GREEN, YELLOW or RED."""
+        # Times are sums of tenths: without the tolerance, 5.0 may come out as 4.999... and a light 0.1 s late.
         since = np.mod(time - self.start + 1e-6, self.cycle)
         return np.where(since < self.green, GREEN, np.where(since < self.green + self.yellow, YELLOW, RED)).astype(
             np.uint8
@@ -34,7 +34,7 @@ class LightPlan:
 
 
 def plan_lights(town: Town, settings: TownSettings, rng: np.random.Generator) -> LightPlan:
-    """The lights' plan: each junction starts its cycle at its own moment, drawn from `rng`."""
+    """Return the plan of a town's lights: each junction starts its cycle at its own moment, drawn from `rng`."""
     share = settings.green + settings.yellow + settings.all_red
     phases = np.array(town.phases)
     shift = rng.uniform(0, 1, len(phases)).round(1) * phases * share

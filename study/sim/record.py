@@ -1,4 +1,4 @@
-"""Recording: drives of TownEnv as Episodes, one for each seed."""
+"""Record drives of TownEnv as Episodes, one for each seed."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from study.sim.town import Town
 from study.stages import RECORD, Batch, Flow, Task
 
 FORMAT_VERSION = FORMAT_VERSIONS["episodes"]  # raised when the same settings and seed give another drive
-BEYOND = 60.0  # of the planned route that is recorded behind the last position [m]
+BEYOND = 60.0  # length of the planned route that is recorded beyond the last position [m]
 STANDING = 0.1  # [m/s]
 
 
 def record_episode(town: TownSettings, recording: RecordingSettings, seed: int) -> Episode:
-    """Drive the town of that seed on autopilot and record it at 10 Hz; the same arguments give the same bits.
+    """Drive the town of that seed by autopilot and record it at 10 Hz; equal arguments give equal bits.
 
     Raises BadInputError when the settings cannot be met.
     """
@@ -58,23 +58,23 @@ def record_episode(town: TownSettings, recording: RecordingSettings, seed: int) 
 
 
 class Recorder:
-    """Watches a road from outside, step by step, and makes an Episode of what it saw."""
+    """Observes a road step by step, and makes an Episode of what it has seen."""
 
     def __init__(self, road: Traffic) -> None:
         self.road = road
-        self.standing = np.zeros(len(road.vehicles))  # since when [s]
+        self.standing = np.zeros(len(road.vehicles))  # for how long [s]
         self.rows: list[dict[str, Any]] = []
         self.plans: dict[int, tuple[list[int], list[float]]] = {}
         self.collided = road.collided
 
     def watch(self) -> None:
-        """Take note of a step that is not recorded."""
+        """Observe a step that is not recorded."""
         _, _, _, speed = self.road.pose()
         self.standing = np.where(speed < STANDING, self.standing + DT, 0)
         self.collided = self.road.collided
 
     def before(self) -> None:
-        """Take the poses from which the next commands follow."""
+        """Record the poses from which the next commands follow."""
         x, y, heading, speed = self.road.pose()
         self.standing = np.where(speed < STANDING, self.standing + DT, 0)
         fleet = self.road.fleet
@@ -84,14 +84,14 @@ class Recorder:
         self.rows.append(row | {"standing": self.standing})
 
     def after(self) -> None:
-        """Take the commands and what they were based on."""
+        """Record the commands and what they were based on."""
         decisions, row = self.road.decisions, self.rows[-1]
         for name in ("steering", "acceleration", "light", "light_distance", "route_s", "lead_gap"):
             row[name] = getattr(decisions, name)
         row["light_state"] = self.road.light_states
 
     def facts(self, cycle: float) -> dict[str, Any]:
-        """How the traffic was: collisions, share of vehicle-time standing longer than `cycle` [s], mean speed [m/s]."""
+        """Return collisions, the share of vehicle-time standing longer than `cycle` [s], and the mean speed [m/s]."""
         standing = np.array([row["standing"] for row in self.rows])
         speed = np.array([row["speed"] for row in self.rows])
         return {
@@ -102,7 +102,7 @@ class Recorder:
         }
 
     def episode(self, name: str, source: dict[str, Any]) -> Episode:
-        """The Episode of all recorded steps; y is turned to the north here, and nowhere else."""
+        """Return the Episode of all recorded steps. Here, and only here, y is turned to point north."""
         town, rows = self.road.town, self.rows
         agents = sorted(self.plans)
         arrays = empty_states(len(rows), len(agents))
@@ -133,13 +133,13 @@ class Recorder:
     def _routes(
         self, agents: list[int], columns: np.ndarray[Any, Any], s: Floats
     ) -> tuple[tuple[np.ndarray[Any, Any], ...], Floats]:
-        """Each agent's way while it was recorded and BEYOND, and where that starts along its route [m]."""
+        """Return each agent's path from its first position to BEYOND its last, and its start on the route [m]."""
         lines, shifts = [], np.zeros(len(agents))
         for column, agent in enumerate(agents):
             strips, starts = self.plans[agent]
-            own = s[columns == column]
-            first = int(np.searchsorted(starts, max(own.min(), 0.0), side="right")) - 1
-            last = int(np.searchsorted(starts, own.max() + BEYOND))
+            progress = s[columns == column]
+            first = int(np.searchsorted(starts, max(progress.min(), 0.0), side="right")) - 1
+            last = int(np.searchsorted(starts, progress.max() + BEYOND))
             shifts[column] = starts[first]
             line = _line(self.road.town, strips[first:last])
             lines.append((line * [1, -1]).astype(np.float32))
@@ -147,7 +147,7 @@ class Recorder:
 
 
 def _line(town: Town, strips: list[int]) -> Floats:
-    """Centre line of joined strips, [P, 2] m: ends of straights, and points within 1 m of each other on arcs."""
+    """Return the centre line of joined strips, [P, 2] m: ends of straights, points at most 1 m apart on arcs."""
     points: list[Floats] = []
     for strip in strips:
         piece = town.strips[strip].piece
@@ -169,28 +169,27 @@ def _lane(town: Town, number: int) -> Lane:
 def record_flow(
     town: TownSettings, recording: RecordingSettings, seeds: Sequence[int], folder: Path
 ) -> Flow[list[Path]]:
-    """Record the drives of `seeds` that `folder` lacks, as `folder/<seed:08d>`; returns all paths in order of `seeds`.
+    """Record the drives of `seeds` that `folder` lacks, as `folder/<seed:08d>`; return all paths in order of `seeds`.
 
-    Whole drives only are ever seen there, so that a killed run can simply be repeated. Raises BadInputError for
-    settings that cannot be met.
+    Each drive is written atomically, so a killed run can simply be repeated. Raises BadInputError for settings that
+    cannot be met.
     """
     paths = [folder / drive_name(seed) for seed in seeds]
     folder.mkdir(parents=True, exist_ok=True)
     with FileLock(folder / ".lock"):
-        _sweep(folder)  # what runs that were killed have left
+        _remove_drafts(folder)  # of runs that were killed
         missing = [(seed, path) for seed, path in zip(seeds, paths, strict=True) if not path.exists()]
         tasks = [Task(RECORD, record_drive, (town, recording, seed, path)) for seed, path in missing]
         yield Batch(tasks, before=len(paths) - len(tasks))
-        _sweep(folder)  # and workers of this one
+        _remove_drafts(folder)  # of workers of this run that were killed
     return paths
 
 
-def _sweep(folder: Path) -> None:
-    """Remove drafts."""
-    for left in folder.glob(".*/"):
-        shutil.rmtree(left)
+def _remove_drafts(folder: Path) -> None:
+    for draft in folder.glob(".*/"):
+        shutil.rmtree(draft)
 
 
 def record_drive(town: TownSettings, recording: RecordingSettings, seed: int, path: Path) -> None:
-    """Record one drive and write it as `path`."""
+    """Record one drive and write it to `path`."""
     write_episode(record_episode(town, recording, seed), path)

@@ -1,7 +1,7 @@
-"""highway-env's network, road and vehicle, all vehicles at once; one flag, `fast`, goes back to the stock ones.
+"""highway-env's network, road and vehicle, computed for all vehicles at once; without `fast`, the stock ones are used.
 
-Look-ups only find candidates: what decides is highway-env's own lane distance and its own polygons. Motion is
-highway-env's formula, operation by operation. So a drive is the same, bit for bit, with either (tests/test_sim_env.py).
+Spatial look-ups only find candidates: highway-env's own lane distance and polygons decide. Motion is highway-env's
+formula, operation by operation. So a drive is bit-equal with and without `fast` (tests/test_sim_env.py).
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from highway_env.road.road import LaneIndex, Road, RoadNetwork
 from highway_env.vehicle.kinematics import Vehicle
 from numpy.typing import NDArray
 
-from study.sim.geometry import Floats, Ints, Pose
+from study.sim.geometry import Floats, Ints, Piece, Pose
 from study.sim.town import Town, highway_lane
 
-CELL = 4.0  # of the grid over the town [m]
+CELL = 4.0  # side of a cell of the grid over the town [m]
 KNOWN = 9.0  # lanes this near to a cell's centre are listed with it [m]
 TIE = 1e-9  # scores nearer than this are settled by highway-env's own arithmetic
 
 
 class TownNetwork(RoadNetwork):
-    """highway-env's network of a town, with a grid that knows which lanes are near."""
+    """highway-env's network of a town, with a grid of the lanes near each cell."""
 
     def __init__(self, town: Town, *, fast: bool = True) -> None:
         super().__init__()
@@ -43,28 +43,17 @@ class TownNetwork(RoadNetwork):
         self.length = np.array([piece.length for piece in pieces])
         self.direction = np.stack([np.cos(self.heading), np.sin(self.heading)], axis=1)
         if fast:
-            self._build_grid()
+            self._build_grid(pieces)
 
-    def _build_grid(self) -> None:
-        """For every cell, the lanes within KNOWN of its centre, nearest first (padded with -1)."""
-        lines = []
-        for piece_start, curvature, heading, length in zip(
-            self.start, self.curvature, self.heading, self.length, strict=True
-        ):
-            s = np.linspace(0, length, math.ceil(length) + 1)
-            turned = heading + curvature * s
-            if curvature == 0:
-                line = piece_start + s[:, None] * np.array([math.cos(heading), math.sin(heading)])
-            else:
-                line = (
-                    piece_start
-                    + np.stack([np.sin(turned) - math.sin(heading), math.cos(heading) - np.cos(turned)], axis=1)
-                    / curvature
-                )
-            lines.append(line)
-        everything = np.concatenate(lines)
-        self.low = everything.min(axis=0) - KNOWN
-        self.cells = np.ceil((everything.max(axis=0) + KNOWN - self.low) / CELL).astype(np.int64)
+    def _build_grid(self, pieces: list[Piece]) -> None:
+        """List for every cell the lanes within KNOWN of its centre, nearest first (padded with -1)."""
+        lines = []  # of each lane, points at most 1 m apart
+        for piece in pieces:
+            x, y, _ = piece.at(np.linspace(0, piece.length, math.ceil(piece.length) + 1))
+            lines.append(np.stack([x, y], axis=1))
+        points = np.concatenate(lines)
+        self.low = points.min(axis=0) - KNOWN
+        self.cells = np.ceil((points.max(axis=0) + KNOWN - self.low) / CELL).astype(np.int64)
         columns: list[tuple[Ints, Ints, Floats]] = []
         for number, line in enumerate(lines):
             begin = ((line.min(axis=0) - KNOWN - self.low) / CELL).astype(np.int64).clip(0)
@@ -72,9 +61,7 @@ class TownNetwork(RoadNetwork):
             cx, cy = np.meshgrid(np.arange(begin[0], end[0]), np.arange(begin[1], end[1]), indexing="ij")
             centres = np.stack([cx.reshape(-1), cy.reshape(-1)], axis=1) * CELL + CELL / 2 + self.low
             dx, dy = centres[:, :1] - line[None, :, 0], centres[:, 1:] - line[None, :, 1]
-            distance = (
-                np.sqrt((dx * dx + dy * dy).min(axis=1)) - 0.51
-            )  # samples are at most 1 m apart: never more than the true distance
+            distance = np.sqrt((dx * dx + dy * dy).min(axis=1)) - 0.51  # never more than the true distance
             close = distance < KNOWN
             cell = (cx.reshape(-1) * self.cells[1] + cy.reshape(-1))[close]
             columns.append((cell, np.full(len(cell), number), distance[close]))
@@ -88,14 +75,14 @@ class TownNetwork(RoadNetwork):
         self.near_lanes[cell, rank], self.near_distance[cell, rank] = lane, distance
 
     def get_closest_lane_index(self, position: NDArray[Any], heading: float | None = None) -> LaneIndex:
-        """highway-env's look-up; with `fast`, only among the lanes near the position."""
+        """Return the closest lane as highway-env does; with `fast`, search only the lanes near the position."""
         if not self.fast or heading is None:
             index: LaneIndex = super().get_closest_lane_index(position, heading)
             return index
         return self.indices[int(self.closest_lanes(np.asarray(position)[None], np.array([heading]))[0])]
 
     def closest_lanes(self, positions: Floats, headings: Floats) -> Ints:
-        """Positions in `indices` of the closest lanes of many poses, [N, 2] m and [N] rad."""
+        """Return the closest lanes of many poses, [N, 2] m and [N] rad, as positions in `indices`."""
         place = np.floor((positions - self.low) / CELL).astype(np.int64)
         outside = ((place < 0) | (place >= self.cells)).any(axis=1)
         cell = np.where(outside, 0, place[:, 0] * self.cells[1] + place[:, 1])
@@ -108,27 +95,27 @@ class TownNetwork(RoadNetwork):
         bound = first.min(axis=1)  # a lane's score is never below its distance, so farther lanes cannot win
         slack = CELL / math.sqrt(2)
         rows, ranks = np.nonzero((distances <= bound[:, None] + slack + TIE) & (lanes >= 0))
-        found = lanes[rows, ranks]
-        scores = self._scores(positions, headings, rows, found)
+        candidates = lanes[rows, ranks]
+        scores = self._scores(positions, headings, rows, candidates)
         best = np.full(len(positions), np.inf)
         np.minimum.at(best, rows, scores)
         close = scores <= best[rows] + TIE
-        rows, found = rows[close], found[close]
+        rows, candidates = rows[close], candidates[close]
         winner = np.full(len(positions), len(self.indices))
-        np.minimum.at(winner, rows, found)
+        np.minimum.at(winner, rows, candidates)
         outside |= ~(bound + slack + TIE < KNOWN)
         tied = np.bincount(rows, minlength=len(positions)) > 1
         for row in np.flatnonzero(tied & ~outside):
-            options = np.sort(found[rows == row])
-            own = [self.lanes[k].distance_with_heading(positions[row], headings[row]) for k in options]
-            winner[row] = options[int(np.argmin(own))]
+            options = np.sort(candidates[rows == row])
+            exact = [self.lanes[k].distance_with_heading(positions[row], headings[row]) for k in options]
+            winner[row] = options[int(np.argmin(exact))]
         for row in np.flatnonzero(outside):
             index = super().get_closest_lane_index(positions[row], headings[row])
             winner[row] = self.indices.index(index)
         return winner
 
     def _scores(self, positions: Floats, headings: Floats, rows: Ints, lanes: Ints) -> Floats:
-        """highway-env's `distance_with_heading` of pairs of a pose (`rows`) and a lane, up to rounding."""
+        """Return highway-env's `distance_with_heading` of pairs of a pose (`rows`) and a lane, up to rounding."""
         delta = positions[rows] - self.start[lanes]
         c, s = self.direction[lanes, 0], self.direction[lanes, 1]
         along, aside = delta[:, 0] * c + delta[:, 1] * s, delta[:, 1] * c - delta[:, 0] * s
@@ -161,18 +148,18 @@ class TownRoad(Road):
 
     @property
     def fast(self) -> bool:
-        """Whether the spatial look-ups are used."""
+        """Return whether the spatial look-ups are used."""
         return bool(self.network.fast)
 
     def pose(self) -> Pose:
-        """x, y [m], heading [rad] and speed [m/s] of all vehicles."""
+        """Return x, y [m], heading [rad] and speed [m/s] of all vehicles."""
         positions = np.concatenate([vehicle.position for vehicle in self.vehicles])
         heading = np.array([vehicle.heading for vehicle in self.vehicles], np.float64)
         speed = np.array([vehicle.speed for vehicle in self.vehicles], np.float64)
         return positions[::2].copy(), positions[1::2].copy(), heading, speed
 
     def pairs_within(self, distance: float, pose: Pose) -> tuple[Ints, Ints]:
-        """All (i, j), i != j, sorted, of vehicles that are nearer to each other than `distance` [m]."""
+        """Return all (i, j), i != j, sorted, of vehicles that are nearer to each other than `distance` [m]."""
         if self.fast:
             x, y, _, _ = pose
             dx, dy = x[:, None] - x[None], y[:, None] - y[None]
@@ -203,7 +190,7 @@ class TownRoad(Road):
             self.vehicles[i].handle_collisions(self.vehicles[j], dt)
 
     def _move(self, dt: float) -> Pose:
-        """Vehicle.step for all vehicles; returns their new pose."""
+        """Do `Vehicle.step` for all vehicles, and return their new pose."""
         x, y, heading, speed = self.pose()
         steering = np.array([vehicle.action["steering"] for vehicle in self.vehicles], np.float64)
         push = np.array([vehicle.action["acceleration"] for vehicle in self.vehicles], np.float64)
@@ -226,7 +213,7 @@ class TownRoad(Road):
         return self.pose() if odd else (place[:, 0], place[:, 1], heading, speed)
 
     def _touching(self, pose: Pose, dt: float) -> tuple[Ints, Ints]:
-        """Pairs i < j that may touch within `dt`: no axis of the two boxes, moved as they will be, separates them."""
+        """Return the pairs i < j that may touch within `dt`: no axis of the two moving boxes separates them."""
         x, y, heading, speed = pose
         reach = TownVehicle.LENGTH + TownVehicle.WIDTH + np.abs(speed) * dt  # more than highway-env's two diagonals
         dx, dy = x[:, None] - x[None], y[:, None] - y[None]
@@ -239,10 +226,10 @@ class TownRoad(Road):
         vx, vy = (speed[i] * c[i] - speed[j] * c[j]) * dt, (speed[i] * s[i] - speed[j] * s[j]) * dt
         parallel, across = np.abs(c[i] * c[j] + s[i] * s[j]), np.abs(c[i] * s[j] - s[i] * c[j])
         for k in (i, j):
-            for ax, ay, own, other in (
+            for ax, ay, half, other_half in (
                 (c[k], s[k], half_length, parallel * half_length + across * half_width),
                 (-s[k], c[k], half_width, parallel * half_width + across * half_length),
             ):
-                between = np.abs(dx * ax + dy * ay) - own - other
+                between = np.abs(dx * ax + dy * ay) - half - other_half
                 apart |= between > np.abs(vx * ax + vy * ay) + 1e-6
         return i[~apart], j[~apart]

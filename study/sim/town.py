@@ -11,6 +11,7 @@ import math
 from dataclasses import dataclass
 from itertools import pairwise
 
+import networkx as nx
 import numpy as np
 from highway_env.road.lane import AbstractLane, CircularLane, LineType, StraightLane
 from numpy.typing import NDArray
@@ -39,7 +40,7 @@ class Signal:
 class Town:
     """A drawn town. M movements; positions in `strips` and `movements` are their names everywhere in the simulator.
 
-    `enter`, `leave`: [M, M] m, where along movement a the front bumper gets, and the rear bumper is out of, the way of
+    `enter`, `leave`: [M, M] m, where along movement a the front bumper enters, and the rear bumper leaves, the space of
     vehicles on movement b; NaN if they never meet.
     `opposing`: [M, M] bool, whether b comes from the arm across. `signal_of`: strip -> its signal, -1 where none.
     `phases`: node -> number of phases of its lights, 0 where there are none. `junctions`: nodes of three or more arms.
@@ -58,7 +59,7 @@ class Town:
 
 
 def highway_lane(strip: Strip) -> AbstractLane:
-    """highway-env's lane of a strip."""
+    """Return highway-env's lane of a strip."""
     piece = strip.piece
     # highway-env draws its other kind of unbroken line straight from start to end
     unbroken = LineType.CONTINUOUS if piece.curvature else LineType.CONTINUOUS_LINE
@@ -77,68 +78,48 @@ def highway_lane(strip: Strip) -> AbstractLane:
     return CircularLane(centre, radius, start, start + piece.curvature * piece.length, clockwise=sign > 0, **options)
 
 
-def _grid(rows: int, columns: int) -> list[tuple[int, int]]:
-    """Streets of the full grid as pairs of nodes; node = row * columns + column."""
+def _drop_streets(settings: TownSettings, rng: np.random.Generator) -> list[tuple[int, int]]:
+    """Return the grid's streets without the dropped ones; 16 junctions of 3 or more arms remain where it allows them.
+
+    A street is a pair of nodes; node = row * columns + column. Every street stays on a round trip, so that no vehicle
+    ever has to turn back.
+    """
+    rows, columns = settings.rows, settings.columns
     across = [(r * columns + c, r * columns + c + 1) for r in range(rows) for c in range(columns - 1)]
     down = [(r * columns + c, (r + 1) * columns + c) for r in range(rows - 1) for c in range(columns)]
-    return across + down
-
-
-def _degrees(streets: list[tuple[int, int]], nodes: int) -> list[int]:
-    return [int(n) for n in np.bincount(np.array(streets).reshape(-1), minlength=nodes)]
-
-
-def _robust(streets: list[tuple[int, int]], nodes: int) -> bool:
-    """Whether every street lies on a round trip, so that nobody ever has to turn back: connected without bridges."""
-    neighbours: dict[int, list[int]] = {node: [] for node in range(nodes)}
-    for a, b in streets:
-        neighbours[a].append(b)
-        neighbours[b].append(a)
-    for left_out in [None, *streets]:
-        seen, todo = {0}, [0]
-        while todo:
-            node = todo.pop()
-            for other in neighbours[node]:
-                if other not in seen and left_out not in ((node, other), (other, node)):
-                    seen.add(other)
-                    todo.append(other)
-        if len(seen) < nodes:
-            return False
-    return True
-
-
-def _drop_streets(settings: TownSettings, rng: np.random.Generator) -> list[tuple[int, int]]:
-    """The grid without the dropped streets, with 16 junctions (3 or more arms) left wherever the grid allows it."""
-    streets = _grid(settings.rows, settings.columns)
-    nodes = settings.rows * settings.columns
-    full = sum(degree >= 3 for degree in _degrees(streets, nodes))
-    needed = min(16, full - settings.dropped_edges)
+    streets = across + down
+    needed = min(16, _junctions(nx.Graph(streets)) - settings.dropped_edges)
     for _ in range(20):
-        left = list(streets)
+        graph, dropped = nx.Graph(streets), 0
         for pick in rng.permutation(len(streets)):
-            if len(left) == len(streets) - settings.dropped_edges:
-                return left
-            fewer = [street for street in left if street != streets[pick]]
-            degrees = _degrees(fewer, nodes)
-            if min(degrees) >= 2 and sum(d >= 3 for d in degrees) >= needed and _robust(fewer, nodes):
-                left = fewer
-        if len(left) == len(streets) - settings.dropped_edges:
-            return left
+            if dropped == settings.dropped_edges:
+                break
+            graph.remove_edge(*streets[pick])
+            if _junctions(graph) >= needed and nx.is_k_edge_connected(graph, 2):
+                dropped += 1
+            else:
+                graph.add_edge(*streets[pick])
+        if dropped == settings.dropped_edges:
+            return [street for street in streets if graph.has_edge(*street)]
     raise BadInputError(
         f"town: cannot leave {settings.dropped_edges} streets out of a {settings.rows} x {settings.columns} grid "
         "and still reach everything without turning back; drop fewer (dropped_edges) or take a larger grid"
     )
 
 
+def _junctions(graph: nx.Graph) -> int:
+    return sum(degree >= 3 for _, degree in graph.degree)
+
+
 def _arm(a: int, b: int, columns: int) -> int:
-    """Side of node `a` on which node `b` lies."""
+    """Return the side of node `a` on which node `b` lies."""
     return {1: 0, columns: 1, -1: 2, -columns: 3}[b - a]
 
 
 def _lane_counts(
     streets: list[tuple[int, int]], degrees: list[int], share: float, rng: np.random.Generator
 ) -> dict[tuple[int, int], int]:
-    """Lanes each way of every street; a bend has as many on both sides, as nobody changes lanes."""
+    """Return the lanes each way of every street; both sides of a bend have as many, as no vehicle changes lanes."""
     group = list(range(len(streets)))
     for node, degree in enumerate(degrees):
         if degree == 2:
@@ -188,10 +169,10 @@ def _lay_out(
     axes: tuple[Floats, Floats],
     rng: np.random.Generator,
 ) -> Town:
-    """A town on these streets, with lanes and bends drawn."""
+    """Return a town on these streets, with lanes and bends drawn."""
     xs, ys = axes
     nodes, columns = len(xs) * len(ys), len(xs)
-    degrees = _degrees(streets, nodes)
+    degrees = np.bincount(np.ravel(streets), minlength=nodes).tolist()
     lanes = _lane_counts(streets, degrees, settings.two_lane_share, rng)
     bends = rng.uniform(*BEND, nodes).round(1)
     draft = _Draft(columns, xs, ys)
@@ -211,22 +192,9 @@ def _lay_out(
 
 
 def _all_reachable(town: Town) -> bool:
-    """Whether every lane leads to every other: nobody changes lanes, so a ring of turning lanes could be a trap."""
-    ahead = {entry: {town.movements[way].exit for way in ways} for entry, ways in town.ways.items()}
-    behind: dict[int, set[int]] = {entry: set() for entry in ahead}
-    for entry, exits in ahead.items():
-        for exit_ in exits:
-            behind[exit_].add(entry)
-    for links in (ahead, behind):
-        start = next(iter(links))
-        seen, todo = {start}, [start]
-        while todo:
-            new = links[todo.pop()] - seen
-            seen |= new
-            todo += new
-        if len(seen) < len(links):
-            return False
-    return True
+    """Return whether every lane leads to every other: a ring of turning lanes would be a trap."""
+    links = [(entry, town.movements[way].exit) for entry, ways in town.ways.items() for way in ways]
+    return bool(nx.is_strongly_connected(nx.DiGraph(links)))
 
 
 class _Draft:

@@ -6,11 +6,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from examples.highway_scenes import SCENES, SHORTEST, record_scene
 from study.config.files import load_profile
 from study.data.birdview import Renderer, valid_moments
 from study.episode.adapt import adapt
 from study.episode.checks import check_episode
-from study.sim.scenes import SCENES, SHORTEST, record_scene
 
 
 @pytest.fixture(scope="module")
