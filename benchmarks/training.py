@@ -42,7 +42,7 @@ from study.config.heads import HEAD_SETS, HEADS
 from study.config.paper import CHANNELS, CORE, IMAGE, KERNEL, LATENT
 from study.config.settings import EncoderSettings, FramesSettings, PolicySettings
 from study.data.frames import Frames, shapes
-from study.encoder import checkpoint, training
+from study.encoder import training
 from study.encoder.autoencoder import MultiHeadAutoencoder
 from study.encoder.batches import plan_training
 from study.encoder.training import train_encoder
@@ -205,18 +205,18 @@ def bare_epochs(frames: Frames, heads: str, settings: EncoderSettings, precision
 def timed_checkpoints() -> Iterator[list[float]]:
     """Seconds of each checkpoint that is written meanwhile."""
     seconds: list[float] = []
-    write = checkpoint.write_checkpoint  # noqa: SLF001 - only here its time can be told from the rest
+    write = training.write_checkpoint  # noqa: SLF001 - only here its time can be told from the rest
 
     def timed(*what: Any) -> None:
         begin = time.perf_counter()
         write(*what)
         seconds.append(time.perf_counter() - begin)
 
-    checkpoint.write_checkpoint = timed  # noqa: SLF001
+    training.write_checkpoint = timed  # noqa: SLF001
     try:
         yield seconds
     finally:
-        checkpoint.write_checkpoint = write  # noqa: SLF001
+        training.write_checkpoint = write  # noqa: SLF001
 
 
 def turn_about(

@@ -288,7 +288,7 @@ def test_bf16_follows_fp32_within_one_percent(frames: Frames) -> None:
 def test_auto_is_fp32_where_the_processor_has_no_bf16(monkeypatch: pytest.MonkeyPatch) -> None:
     cpu = torch.device("cpu")
     for flags, expected in (({"avx2"}, "fp32"), ({"avx512f", "amx_bf16"}, "bf16")):
-        monkeypatch.setattr(device, "_cpu_flags", lambda flags=flags: flags)
+        monkeypatch.setattr(device, "cpu_lines", lambda _, flags=flags: [" ".join(flags)])
         assert choose_precision("auto", cpu) == expected
     assert choose_precision("fp32", cpu) == "fp32"
 

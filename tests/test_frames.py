@@ -166,12 +166,12 @@ def test_no_drive_serves_both_sets(drives, tmp_path):
 @pytest.mark.parametrize(
     ("settings", "says"),
     [
-        ({"encoder": 10**10}, "free and the frames need"),
+        ({"encoder": 10**10}, "its drives give"),
         ({"policy": 5000}, "policy set needs 4000 training frames and its drives give"),
     ],
 )
 def test_what_cannot_be_met_is_refused(drives, tmp_path, settings, says):
-    """Too little disk is seen before any work; neither leaves something that looks like a store."""
+    """Nothing is left that looks like a store."""
     with pytest.raises(BadInputError, match=says):
         run_flow(frames_flow(FRAMES.model_copy(update=settings), VIEW, *drives, tmp_path / "store"))
     assert not (tmp_path / "store").exists()

@@ -5,16 +5,16 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import resource
-from pathlib import Path
 from typing import Any, Literal
 
 import torch
 
+from study.compute.provenance import cpu_lines
 from study.errors import BadInputError, one_of
 
 
 def check_device(name: str) -> torch.device:
-    """The torch device of that name. Raises BadInputError when this machine lacks it."""
+    """Return the torch device of that name. Raises BadInputError when this machine lacks it."""
     try:
         device = torch.device(name)
     except RuntimeError as error:
@@ -29,28 +29,20 @@ def check_device(name: str) -> torch.device:
 
 
 def choose_precision(setting: Literal["auto", "fp32", "bf16"], device: torch.device) -> Literal["fp32", "bf16"]:
-    """The precision of the networks in training; "auto" is bf16 where the hardware multiplies bf16 matrices itself."""
+    """Return the precision of training; "auto" is bf16 where the hardware multiplies bf16 matrices itself."""
     if setting != "auto":
         return setting
     if device.type == "cuda":
         native = torch.cuda.get_device_capability(device) >= (8, 0)
     else:
-        native = "amx_bf16" in _cpu_flags() or "avx512_bf16" in _cpu_flags()
+        native = not {"amx_bf16", "avx512_bf16"}.isdisjoint(cpu_lines("flags")[0].split())
     return "bf16" if native else "fp32"
 
 
-def _cpu_flags() -> set[str]:
-    with contextlib.suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text(encoding="ascii", errors="ignore").splitlines():
-            if line.startswith("flags"):
-                return set(line.split())
-    return set()
-
-
 def keep_memory() -> None:
-    """Let glibc keep freed blocks, for giving each one back costs a third of the speed at batch 2048 (page faults).
+    """Let glibc keep freed blocks: returning each costs a third of the speed at batch 2048 (page faults).
 
-    Blocks above 150 MB still go back: kept, they would leave gaps, and the paper's batch would need 5 GB instead of 4.
+    Blocks above 150 MB are still returned: kept, they would leave gaps, and the paper's batch would take 5 GB, not 4.
     """
     with contextlib.suppress(OSError, AttributeError):
         libc = ctypes.CDLL(None)

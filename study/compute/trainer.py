@@ -17,10 +17,9 @@ from study.errors import BadInputError
 
 @contextmanager
 def trainer(device: torch.device, epochs: int, load: str, remedy: str, **options: Any) -> Iterator[lightning.Trainer]:
-    """A Trainer for `epochs` on a device; `options` are Lightning's own.
+    """Yield a Trainer for `epochs` on a device; `options` are Lightning's own.
 
-    Raises BadInputError when the device has too little memory for the `load`, with the
-    `remedy`.
+    Raises BadInputError with the `remedy` when the device has too little memory for the `load`.
     """
     logger = logging.getLogger("lightning.pytorch")
     level = logger.level
@@ -42,7 +41,7 @@ def trainer(device: torch.device, epochs: int, load: str, remedy: str, **options
     except torch.OutOfMemoryError as error:
         raise BadInputError(f"{device} has too little memory for {load} ({error}); {remedy}") from error
     except SystemExit as error:
-        if isinstance(error.__context__, KeyboardInterrupt):  # Lightning makes Ctrl-C an exit with code 1
+        if isinstance(error.__context__, KeyboardInterrupt):  # Lightning turns Ctrl-C into an exit with code 1
             raise KeyboardInterrupt from None
         raise
     finally:

@@ -25,7 +25,6 @@ from study.data.targets import FRACTION_BITS, Floats, Moment, find_target, fixed
 from study.episode.schema import GREEN, RATE_HZ, Episode, Lane
 from study.errors import BadInputError
 
-FORMAT_VERSION = 1  # raise it when the same Episode and settings give other pixels
 MASK_BYTES = IMAGE * IMAGE // 8
 
 SURFACE = (16, 8)  # grey of a lane: the first, and how much lighter for each LIMIT_STEP of its speed limit

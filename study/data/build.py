@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import io
 import json
 import os
 import shutil
@@ -26,7 +25,7 @@ from study.data.frames import PARTS, SCHEMA_VERSION, DamagedFramesError, open_fr
 from study.data.selection import LABELS, SETS, Columns, candidates, choose, histograms
 from study.episode.files import episode_digest, file_digest, read_episode
 from study.errors import BadInputError
-from study.stages import RENDER, SELECT, Batch, Flow, Task, size
+from study.stages import RENDER, SELECT, Batch, Flow, Task
 
 CHUNK = 512  # frames painted before they are written: 7 MB
 
@@ -40,11 +39,13 @@ def frames_flow(
     *,
     key: str | None = None,
 ) -> Flow[None]:
-    """Build the frame store `folder` from recorded drives; nothing happens when it is there already, and whole.
+    """Build the frame store `folder` from recorded drives, unless it exists and is undamaged.
 
-    `key` names the store; by default it follows from the settings and the drives' digests. A build that was killed
-    resumes. Raises BadInputError when the drives give too few frames, serve both sets, are no Episodes, when the disk
-    is too small, or when `folder` holds something else.
+    Every drive is read once for its candidate moments, the frames are chosen from all of them (`choose`), then the
+    frames of every drive are painted into their rows of preallocated files. Each painted part leaves a note, so that a
+    killed build resumes and ends with the same bytes. `key` names the store; by default it follows from the settings
+    and the drives' digests. Raises BadInputError when the drives give too few frames, serve both sets or are no
+    Episodes, or when `folder` holds something else.
     """
     sources = {"encoder": _sources(encoder_episodes), "policy": _sources(policy_episodes)}
     _check_sources(sources)
@@ -75,7 +76,7 @@ def _check_sources(sources: dict[str, list[dict[str, str]]]) -> None:
 
 @dataclass(frozen=True)
 class _Build:
-    """One build: what goes in, where it goes."""
+    """The inputs and the folder of a build."""
 
     frames: FramesSettings
     birdview: BirdviewSettings
@@ -85,24 +86,30 @@ class _Build:
     given_key: str | None
 
     @property
+    def settings(self) -> dict[str, Any]:
+        """Return the settings that decide the bytes of the store."""
+        return {
+            "frames": self.frames.model_dump(mode="json", exclude={"unit"}),
+            "birdview": self.birdview.model_dump(mode="json"),
+        }
+
+    @property
     def inputs(self) -> str:
-        """Digest of all that decides the store's bytes."""
-        own: dict[str, Any] = {"frames": self.frames.model_dump(mode="json", exclude={"unit"}), "sources": self.sources}
-        own |= {"birdview": self.birdview.model_dump(mode="json")}
-        if further_masks():
-            own["masks"] = further_masks()
+        """Return the digest of everything that decides the bytes of the store."""
+        own = {**self.settings, "sources": self.sources, **({"masks": further_masks()} if further_masks() else {})}
         return content_key("frames", own, (), FORMAT_VERSIONS["frames"])
 
     @property
-    def targets(self) -> list[str]:
-        return [head.target for head in mask_heads().values()]
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Return the shape of one frame in each array."""
+        return shapes(len(mask_heads()))
 
     @property
     def draft(self) -> Path:
         return self.folder.with_name(f".{self.folder.name}.building")
 
     def finished(self) -> bool:
-        """Whether the folder holds the store of these inputs; a damaged one becomes a draft, to be cleared away.
+        """Return whether the folder holds the store of these inputs; a damaged one becomes a draft, to be removed.
 
         Raises BadInputError when it holds something else.
         """
@@ -123,23 +130,20 @@ class _Build:
     def flow(self) -> Flow[None]:
         plan = yield from self._plan()
         self._allocate(plan)
-        parts = yield from self._render(plan)
+        parts = yield from self._render()
         manifest = {
             "schema_version": SCHEMA_VERSION,
             "key": self.given_key or self.inputs,
             "inputs": self.inputs,
             "digest": content_key("store", [[plan[name]["columns"], parts[name]] for name in SETS], (), SCHEMA_VERSION),
-            "settings": {
-                "frames": self.frames.model_dump(mode="json", exclude={"unit"}),
-                "birdview": self.birdview.model_dump(mode="json"),
-            },
+            "settings": self.settings,
             "sources": self.sources,
             "sets": {
                 name: plan[name]
                 | {
                     "arrays": {
                         key: {"shape": [plan[name]["frames"], *shape], "dtype": "uint8"}
-                        for key, shape in shapes(len(self.targets)).items()
+                        for key, shape in self.shapes.items()
                     },
                     "parts": parts[name],
                 }
@@ -152,7 +156,7 @@ class _Build:
         self.draft.rename(self.folder)
 
     def _plan(self) -> Flow[dict[str, Any]]:
-        """Choose the frames, or take up the choice of a build that was killed. The draft holds the labels then."""
+        """Choose the frames and write their labels into the draft, or resume with the choice of a killed build."""
         path = self.draft / "plan.json"
         if path.is_file():
             plan: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
@@ -163,7 +167,6 @@ class _Build:
                 return plan
         if self.draft.exists():
             shutil.rmtree(self.draft)
-        self._check_room()
         tables: list[Columns] = yield Batch(
             [
                 Task(SELECT, candidates, (path, number, name, self.frames, self.birdview))
@@ -196,31 +199,20 @@ class _Build:
         _write_json(path, plan)
         return plan
 
-    def _check_room(self) -> None:
-        each = sum(int(np.prod(shape)) for shape in shapes(len(self.targets)).values()) + 60
-        need = (self.frames.encoder + self.frames.policy) * each
-        free = shutil.disk_usage(self.folder.parent).free
-        if need > free:
-            raise BadInputError(
-                f"{self.folder.parent} has {size(free)} free and the frames need {size(need)}: free some "
-                "room, name another folder, or lower --frames.encoder and --frames.policy"
-            )
-
     def _allocate(self, plan: dict[str, Any]) -> None:
-        """Take the whole room at once, so that a full disk shows now and not in an hour."""
+        """Allocate all arrays at once, so that a full disk shows now and not in an hour."""
+        if (self.draft / PARTS).is_dir():
+            return
         for name in SETS:
-            for key, shape in shapes(len(self.targets)).items():
+            for key, shape in self.shapes.items():
                 path = self.draft / name / f"{key}.npy"
-                whole = (plan[name]["frames"], *shape)
-                length = _header(whole) + int(np.prod(whole))
-                if not (path.is_file() and path.stat().st_size == length):
-                    shutil.rmtree(self.draft / PARTS, ignore_errors=True)
-                    np.lib.format.open_memmap(path, mode="w+", dtype=np.uint8, shape=whole)
+                np.lib.format.open_memmap(path, mode="w+", dtype=np.uint8, shape=(plan[name]["frames"], *shape))
                 with path.open("r+b") as stream:
-                    os.posix_fallocate(stream.fileno(), 0, length)
+                    os.posix_fallocate(stream.fileno(), 0, path.stat().st_size)
+        (self.draft / PARTS).mkdir()
 
-    def _render(self, plan: dict[str, Any]) -> Flow[dict[str, list[dict[str, Any]]]]:
-        (self.draft / PARTS).mkdir(exist_ok=True)
+    def _render(self) -> Flow[dict[str, list[dict[str, Any]]]]:
+        targets = [head.target for head in mask_heads().values()]
         tasks: list[Task] = []
         notes: list[Path] = []
         done = 0
@@ -235,9 +227,7 @@ class _Build:
                     continue
                 moments = np.stack([step[start:end], agent[start:end]], axis=1)
                 part = (self.paths[name][episode[start]], self.birdview, moments, self.draft / name, start)
-                tasks.append(
-                    Task(RENDER, _render_part, (*part, plan[name]["frames"], notes[-1], self.targets), end - start)
-                )
+                tasks.append(Task(RENDER, _render_part, (*part, notes[-1], targets), end - start))
         yield Batch(tasks, done)
         parts: dict[str, list[dict[str, Any]]] = {name: [] for name in SETS}
         for note in notes:  # in the order of their rows
@@ -254,39 +244,33 @@ def _write_json(path: Path, content: dict[str, Any]) -> None:
     draft.replace(path)
 
 
-def _header(shape: tuple[int, ...]) -> int:
-    """Bytes before the numbers in an .npy file of uint8."""
-    stream = io.BytesIO()
-    np.lib.format.write_array_header_1_0(stream, {"descr": "|u1", "fortran_order": False, "shape": shape})
-    return len(stream.getvalue())
-
-
 def _render_part(
     path: Path,
     settings: BirdviewSettings,
     moments: NDArray[np.int32],
     folder: Path,
     start: int,
-    frames: int,
     note: Path,
     targets: Sequence[str],
 ) -> None:
-    """Paint frames of one drive, [M, 2] of (step, agent id), into the rows from `start` on, and then note it."""
+    """Paint frames of one drive, [M, 2] of (step, agent id), into the rows from `start` on, and write a note of it."""
     episode = read_episode(path)
     positions = {agent.id: index for index, agent in enumerate(episode.agents)}
     where = np.array([(step, positions[agent]) for step, agent in moments.tolist()])
-    renderer, arrays = Renderer(episode, settings, targets), shapes(len(targets))
-    digests = {name: hashlib.sha256() for name in arrays}
+    renderer = Renderer(episode, settings, targets)
+    names = tuple(shapes(len(targets)))
+    digests = {name: hashlib.sha256() for name in names}
     with contextlib.ExitStack() as stack:
-        streams = {name: stack.enter_context((folder / f"{name}.npy").open("r+b")) for name in arrays}
-        for name, shape in arrays.items():
-            streams[name].seek(_header((frames, *shape)) + start * int(np.prod(shape)))
+        streams = {}
+        for name in names:
+            array = np.load(folder / f"{name}.npy", mmap_mode="r")
+            streams[name] = stack.enter_context((folder / f"{name}.npy").open("r+b"))
+            streams[name].seek(array.offset + start * array[:1].nbytes)
         for first in range(0, len(where), CHUNK):
-            for name, array in zip(arrays, renderer.render(where[first : first + CHUNK]), strict=True):
-                streams[name].write(array.data)
-                digests[name].update(array.data)
+            for name, frames in zip(names, renderer.render(where[first : first + CHUNK]), strict=True):
+                streams[name].write(frames.data)
+                digests[name].update(frames.data)
         for stream in streams.values():
             stream.flush()
-            os.fsync(stream.fileno())  # the note must not tell of rows that a power cut takes back
-    part = {"start": start, "rows": len(where)} | {name: digest.hexdigest() for name, digest in digests.items()}
-    _write_json(note, part)
+            os.fsync(stream.fileno())  # a power cut must not take back rows that the note tells of
+    _write_json(note, {"start": start, "rows": len(where), **{name: digests[name].hexdigest() for name in names}})

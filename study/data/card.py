@@ -1,7 +1,7 @@
 """Data card: what is in a frame store and in the drives that it came from, as numbers, a text and a figure.
 
-The card lies beside the frames, in `card/`: `card.json` (every number), `card.txt` and `card.png`. Whatever would take
-long at the paper's scale is taken from a random part of the frames, and says how many.
+The card lies beside the frames, in `card/`: `card.json` (every number), `card.txt` and `card.png`. Numbers that would
+take long at the paper's scale are taken from a random part of the frames, with its size beside them.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ Grey = NDArray[np.uint8]
 
 
 def make_card(store: FrameStore, drives: Sequence[Path]) -> dict[str, Any]:
-    """The numbers of the card: plain values, the same for the same store and drives.
+    """Return the numbers of the card: plain values, the same for the same store and drives.
 
-    `drives` are the store's source drives as far as they are still there; what is read from drives is counted over
-    those. Raises BadInputError when one of them is no Episode.
+    `drives` are those of the store's source drives that still exist; what is read from drives is counted over them.
+    Raises BadInputError when one of them is no Episode.
     """
     paths = {episode_digest(path): path for path in drives}
     wanted = [source["digest"] for name in SETS for source in store.manifest["sources"][name]]
-    found = [paths[digest] for digest in wanted if digest in paths]
+    existing = [paths[digest] for digest in wanted if digest in paths]
     sets = {}
     for number, name in enumerate(SETS):
         frames: Frames = getattr(store, name)
@@ -60,15 +60,15 @@ def make_card(store: FrameStore, drives: Sequence[Path]) -> dict[str, Any]:
         "key": store.key,
         "split": store.manifest["settings"]["frames"]["split"],
         "view": store.manifest["settings"]["birdview"]["view"],
-        "drives": {"used": len(wanted), "here": len(found)} | (_drives(found) if found else {}),
+        "drives": {"used": len(wanted), "here": len(existing)} | (_drives(existing) if existing else {}),
         "sets": sets,
     }
 
 
 def write_card(store: FrameStore, drives: Sequence[Path], folder: Path) -> tuple[Path, ...]:
-    """Make the card of the store in `folder` and write it there, whole or not at all; returns its files."""
-    from study.figures.data_card import data_card  # noqa: PLC0415 - matplotlib; a card that is there needs none
-    from study.figures.style import write  # noqa: PLC0415 - matplotlib; a card that is there needs none
+    """Write the card of the store in `folder`, atomically, and return its files."""
+    from study.figures.data_card import data_card  # noqa: PLC0415 - matplotlib, which a card that exists does not need
+    from study.figures.style import write  # noqa: PLC0415 - as above
 
     card = make_card(store, drives)
     with atomic_folder(folder / "card") as draft:
@@ -79,13 +79,13 @@ def write_card(store: FrameStore, drives: Sequence[Path], folder: Path) -> tuple
 
 
 def card_files(store: FrameStore, drives: Sequence[Path], folder: Path) -> tuple[Path, ...]:
-    """The files of the card beside the frames in `folder`, made when they are not there yet."""
+    """Return the files of the card beside the frames in `folder`; writes them where they are missing."""
     files = tuple(folder / "card" / name for name in FILES)
     return files if all(file.is_file() for file in files) else write_card(store, drives, folder)
 
 
 def source_drives(store: FrameStore, folder: Path) -> list[Path]:
-    """The drives in `folder` that the store was made from, as far as they are still there."""
+    """Return the drives in `folder` that the store was made from, as far as they still exist."""
     names = [Path(source["name"]).name for name in SETS for source in store.manifest["sources"][name]]
     return [folder / name for name in names if (folder / name / "episode.json").is_file()]
 
@@ -94,7 +94,7 @@ def source_drives(store: FrameStore, folder: Path) -> list[Path]:
 
 
 def _drives(paths: Sequence[Path]) -> dict[str, Any]:
-    """Sums over the drives, from their heads and one column of their states."""
+    """Return sums over the drives, from their heads and one column of their states."""
     seconds, vehicle_seconds, metres, vehicles = 0.0, 0.0, 0.0, 0
     maps, seeds, writers, labels = set(), set(), set(), set()
     for path in paths:
@@ -123,7 +123,7 @@ def _drives(paths: Sequence[Path]) -> dict[str, Any]:
 def _agents_in_view(
     frames: Frames, sources: Sequence[Path | None], birdview: dict[str, Any], number: int
 ) -> dict[str, Any]:
-    """How many other vehicles' centres lie in the field of view, in frames of a few random drives."""
+    """Count the other vehicles whose centres lie in the field of view, in frames of a few random drives."""
     rng = np.random.default_rng([_VIEW, number])
     episode = frames.labels["episode"].to_numpy()
     here = [drive for drive in np.unique(episode).tolist() if sources[drive] is not None]
@@ -155,11 +155,11 @@ def _others(labels: pd.DataFrame, path: Path, birdview: dict[str, Any]) -> list[
 
 
 def _twins(frames: Frames, test_share: float, number: int) -> dict[str, Any]:
-    """Distance of test frames to their nearest training frame, when whole drives and when single frames are split.
+    """Return the distances of test frames to their nearest training frame, when drives and when frames are split.
 
-    Whole drives are drawn until they have POOL frames, so that what lies close in time stays together; the same
+    Complete drives are drawn until they have POOL frames, so that what lies close in time stays together; the same
     frames are then split both ways, into parts of about the same size. Frames of a single drive can only be split one
-    by one: there is no entry `episode` then.
+    by one: then there is no entry `episode`.
     """
     rng = np.random.default_rng([_POOL, number])
     episode = frames.labels["episode"].to_numpy()
@@ -178,7 +178,7 @@ def _twins(frames: Frames, test_share: float, number: int) -> dict[str, Any]:
     by_frame = np.zeros(len(rows), bool)
     tests = int(by_drive.sum()) or max(1, round(len(rows) * test_share))
     by_frame[np.random.default_rng([_FRAME, number]).permutation(len(rows))[:tests]] = True
-    found: dict[str, Any] = {"frames": len(rows), "drives": len(drawn)}
+    distances: dict[str, Any] = {"frames": len(rows), "drives": len(drawn)}
     for name, test in (("episode", by_drive), ("frame", by_frame)):
         if not test.any():
             continue
@@ -186,7 +186,7 @@ def _twins(frames: Frames, test_share: float, number: int) -> dict[str, Any]:
         asked = np.sort(rng.permutation(asked)[:QUERIES])
         distance, nearest = nearest_frames(pictures[asked], pictures[~test])
         same = drive[~test][nearest] == drive[asked]
-        found[name] = {
+        distances[name] = {
             "train": int((~test).sum()),
             "test": int(test.sum()),
             "asked": len(asked),
@@ -195,11 +195,11 @@ def _twins(frames: Frames, test_share: float, number: int) -> dict[str, Any]:
             "same_drive": round(float(same.mean()), 4),
             "within": [round(float((distance <= limit).mean()), 4) for limit in DISTANCES],
         }
-    return found
+    return distances
 
 
 def thumbnails(images: Grey, rows: NDArray[np.int64]) -> Grey:
-    """Area averages of rows of images [N, 64, 64, 3] as grey thumbnails [M, 256] uint8."""
+    """Return the area averages of rows of images [N, 64, 64, 3] as grey thumbnails [M, 256] uint8."""
     small = np.empty((len(rows), SIDE * SIDE), np.uint8)
     block = IMAGE // SIDE
     weights = np.array([77, 150, 29]) / (256 * block * block)  # of red, green and blue in what the eye calls bright
@@ -229,83 +229,78 @@ def nearest_frames(asked: Grey, among: Grey) -> tuple[NDArray[np.float64], NDArr
 
 
 def card_text(card: dict[str, Any]) -> str:
-    """The card in words and columns."""
+    """Return the card as text."""
     drives = card["drives"]
-    lines = [f"Data card of frame store {card['key']}", "", *_drive_lines(drives)]
+    lines = [f"Data card of frame store {card['key']}", ""]
+    if "towns" in drives:
+        here = "" if drives["here"] == drives["used"] else f", {drives['here']} of them here and counted"
+        lines += [
+            f"drives         {drives['used']} episodes{here}",
+            f"towns          {drives['towns']} different maps, {drives['seeds']} seeds",
+            f"written by     {', '.join(drives['writers'])}; labels {', '.join(drives['labels'])}",
+            f"driven         {drives['hours']:.2f} h of traffic",
+            f"vehicles       {drives['vehicles']:,}; {drives['vehicle_hours']:.1f} h, {drives['vehicle_km']:,.0f} km",
+        ]
+    else:
+        lines.append(f"drives         {drives['used']}, none of them here: nothing is known of them")
     for name, entry in card["sets"].items():
         lines += ["", *_set_lines(name, entry, card)]
     return "\n".join(lines) + "\n"
-
-
-def _drive_lines(drives: dict[str, Any]) -> list[str]:
-    if "towns" not in drives:
-        return [f"drives         {drives['used']}, none of them here any more: nothing is said of them"]
-    part = "" if drives["here"] == drives["used"] else f", {drives['here']} of them here: the numbers are theirs"
-    return [
-        f"drives         {drives['used']} episodes{part}",
-        f"towns          {drives['towns']} different maps, {drives['seeds']} seeds",
-        f"written by     {', '.join(drives['writers'])}; labels {', '.join(drives['labels'])}",
-        f"driven         {drives['hours']:.2f} h of traffic",
-        f"vehicle time   {drives['vehicle_hours']:.1f} h, {drives['vehicle_km']:,.0f} km",
-        f"vehicles       {drives['vehicles']:,}",
-    ]
 
 
 def _set_lines(name: str, entry: dict[str, Any], card: dict[str, Any]) -> list[str]:
     before, after = entry["candidates"], entry["chosen"]["all"]
     test = "" if card["split"] == "frame" else f", test drives {len(entry['test_drives'])}"
     edges = after["steering_edges"]
-    bins = [f"< {edges[0]:g}", *(f"{low:g} to {high:g}" for low, high in pairwise(edges))]
-    table = [
-        *((f"steering {label}", "steering", index) for index, label in enumerate([*bins, f"> {edges[-1]:g}"])),
-        *((f"command {value:g}", "acceleration", index) for index, value in enumerate(ACCELERATIONS)),
-        *((f"light {light}", "light", index) for index, light in enumerate(("none or green", "yellow", "red"))),
-    ]
+    bins = [f"< {edges[0]:g}", *(f"{low:g} to {high:g}" for low, high in pairwise(edges)), f"> {edges[-1]:g}"]
+    labels = {
+        "steering": [f"steering {label}" for label in bins],
+        "acceleration": [f"command {value:g}" for value in ACCELERATIONS],
+        "light": [f"light {light}" for light in ("none or green", "yellow", "red")],
+    }
+    rows = [(label, before[key][i], after[key][i]) for key in labels for i, label in enumerate(labels[key])]
     parts = f"{entry['train']:,} train and {entry['test']:,} test"
     lines = [
         f"{name} set: {entry['frames']:,} frames, {parts}, split by {card['split']}{test}",
         f"  {'':<24}{'before selection':>22}{'after':>20}",
         f"  {'frames':<24}{before['frames']:>22,}{after['frames']:>20,}",
     ]
-    rows = [(label, before[key][index], after[key][index]) for label, key, index in table]
-    for label, was, is_ in [*rows, ("standing", before["standing"], after["standing"])]:
-        lines.append(f"  {label:<24}{_share(was, before['frames']):>22}{_share(is_, after['frames']):>20}")
+    for label, *counts in [*rows, ("standing", before["standing"], after["standing"])]:
+        first, second = (
+            f"{count:,} ({100 * count / max(part['frames'], 1):5.1f} %)"
+            for count, part in zip(counts, (before, after), strict=True)
+        )
+        lines.append(f"  {label:<24}{first:>22}{second:>20}")
     lines.append(f"  guessing the commonest class is right in {100 * after['majority_accuracy']:.1f} %")
-    return [*lines, *_view_lines(entry["agents_in_view"], card["view"]), *_twin_lines(entry["twins"])]
+    return [*lines, _view_line(entry["agents_in_view"], card["view"]), *_twin_lines(entry["twins"])]
 
 
-def _share(count: int, whole: int) -> str:
-    return f"{count:,} ({100 * count / max(whole, 1):5.1f} %)"
-
-
-def _view_lines(seen: dict[str, Any], view: float) -> list[str]:
+def _view_line(seen: dict[str, Any], view: float) -> str:
     if not seen["frames"]:
-        return ["  other vehicles in view   unknown: the drives are not here"]
+        return "  other vehicles in view: unknown, the drives are not here"
     counts = np.repeat(np.arange(len(seen["counts"])), seen["counts"])
     low, middle, high = np.quantile(counts, (0.05, 0.5, 0.95))
-    spread = f"median {middle:.0f}, 5 to 95 % {low:.0f} to {high:.0f}"
-    return [
-        f"  other vehicles in view   {counts.mean():.1f} on average, {spread} ({view:g} m a side;",
-        f"                           n = {seen['frames']:,} frames of {seen['drives']} drives)",
-    ]
+    return (
+        f"  other vehicles in view ({view:g} m a side): mean {counts.mean():.1f}, median {middle:.0f}, 5 to 95 % "
+        f"{low:.0f} to {high:.0f} (n = {seen['frames']:,} frames of {seen['drives']} drives)"
+    )
 
 
 def _twin_lines(twins: dict[str, Any]) -> list[str]:
     lines = [
-        f"  twins: distance of a test frame to its nearest training frame, root mean square over {SIDE}x{SIDE} grey",
-        f"  pixels, in grey levels of 255; {twins['frames']:,} frames of {twins['drives']} drives, split both ways",
+        f"  distance of a test frame to its nearest training frame, root mean square over {SIDE}x{SIDE} grey pixels,",
+        f"  in grey levels of 255; {twins['frames']:,} frames of {twins['drives']} drives, split both ways",
     ]
     for name in ("episode", "frame"):
         if name not in twins:
             lines.append(f"    split: {name:<8} all frames are of one drive")
             continue
         part = twins[name]
-        quantiles = ", ".join(
-            f"{100 * share:.0f} % {value:.2f}" for share, value in zip(QUANTILES, part["quantiles"], strict=True)
-        )
+        values = zip(QUANTILES, part["quantiles"], strict=True)
+        quantiles = ", ".join(f"{100 * share:.0f} % {value:.2f}" for share, value in values)
         count = f"n = {part['asked']:,} of {part['test']:,} test frames against {part['train']:,}"
         lines += [
-            f"    split: {name:<8} quantiles {quantiles}; under {TWIN:g}: {100 * part['twins']:.1f} %;",
+            f"    split: {name:<8} quantiles {quantiles}; below {TWIN:g}: {100 * part['twins']:.1f} %;",
             f"      nearest in the same drive: {100 * part['same_drive']:.1f} % ({count})",
         ]
     return lines

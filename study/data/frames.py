@@ -1,16 +1,14 @@
-"""Frame store: which recorded moments become frames, and their images, masks and labels on disk (Sec. IV-A, V).
+"""Frame store: recorded moments as images, masks and labels on disk (Sec. IV-A, V).
 
 A store is a folder, written once and then only read:
 
 `manifest.json`             key, settings, source drives with digests, counts, digests, histograms before and after
 `encoder/`, `policy/`       the two sets, from different drives, each with
     `images.npy`            [N, 64, 64, 3] uint8 RGB
-    `masks.npy`             [N, 2, 512] uint8: pred, plan and those of further heads, 4096 bits each, see `unpack_masks`
+    `masks.npy`             [N, K, 512] uint8: pred, plan and those of further heads, 4096 bits each
     `labels.parquet`        one row for each frame, columns LABELS
 
-The main path is `frames_flow`: every drive is read once for its candidate moments, the frames are chosen from all of
-them (`choose`), then every drive's frames are painted into their rows of preallocated files. Each part that is painted
-leaves a note, so a build that was killed resumes, and ends with the same bytes wherever its tasks ran.
+`study.data.build` writes it.
 """
 
 from __future__ import annotations
@@ -41,12 +39,12 @@ Bytes = NDArray[np.uint8]
 
 
 class DamagedFramesError(BadInputError):
-    """A store that is not whole: made again from its drives, it is what it was."""
+    """A damaged store: built again from its drives, it has the same bytes."""
 
 
 @dataclass(frozen=True)
 class Frames:
-    """One set of N frames: `images` [N, 64, 64, 3] uint8 RGB, `masks` [N, 2, 512] uint8, `labels` with N rows.
+    """One set of N frames: `images` [N, 64, 64, 3] uint8 RGB, `masks` [N, K, 512] uint8, `labels` with N rows.
 
     The arrays are memory-mapped; rows are ordered by drive, step and vehicle.
     """
@@ -56,18 +54,19 @@ class Frames:
     labels: pd.DataFrame
 
     def __len__(self) -> int:
-        """N."""
+        """Return N."""
         return len(self.images)
 
     def indices(self, split: Literal["train", "test"]) -> Indices:
-        """Rows of a split, sorted."""
+        """Return the rows of a split, sorted."""
         train = self.labels["train"].to_numpy()
         return np.flatnonzero(train if split == "train" else ~train).astype(np.int64)
 
     def subset(self, fraction: float, unit: Literal["frame", "drive"], seed: int) -> Indices:
-        """Rows of a random part of the training frames, sorted (Sec. V-B); smaller parts lie within larger ones.
+        """Return the rows of a random part of the training frames, sorted (Sec. V-B).
 
-        `unit` says whether single frames or whole drives are drawn. Raises BadInputError when nothing is left.
+        Smaller parts lie within larger ones. `unit`: draw frames, or complete drives. Raises BadInputError when nothing
+        is left.
         """
         if not 0 < fraction <= 1:
             raise BadInputError(f"data fraction {fraction}: it must be above 0 and at most 1")
@@ -80,7 +79,9 @@ class Frames:
             drawn = rng.permutation(np.unique(drives))
             part = train[np.isin(drives, drawn[: round(fraction * len(drawn))])]
         if not len(part):
-            raise BadInputError(f"a fraction of {fraction:g} of the training {unit}s is none at all; take a larger one")
+            raise BadInputError(
+                f"a fraction of {fraction:g} of the training {unit}s is none at all; choose a larger one"
+            )
         return np.sort(part)
 
 
@@ -100,20 +101,20 @@ def shapes(masks: int) -> dict[str, tuple[int, ...]]:
 
 
 def unpack_masks(masks: Bytes) -> Bytes:
-    """Packed masks [B, 2, 512] as [B, 2, 64, 64] uint8 of 0 and 1: pred, plan."""
+    """Return packed masks [.., 512] as [.., 64, 64] uint8 of 0 and 1."""
     return np.unpackbits(masks, axis=-1).reshape(*masks.shape[:-1], IMAGE, IMAGE)
 
 
 def epoch_order(indices: Indices, seed: int, epoch: int) -> Indices:
-    """The rows in the random order of one epoch: a function of seed and epoch only, so a resumed run sees the same."""
+    """Return the rows in the random order of one epoch, which depends on nothing but seed and epoch."""
     return np.random.default_rng([seed, _ORDER, epoch]).permutation(indices)
 
 
 def open_frames(folder: Path, *, check: bool = False) -> FrameStore:
     """Open the store in `folder`; with `check`, compare every byte of the arrays with the manifest's digests.
 
-    Raises BadInputError when the folder holds no store of this format, and DamagedFramesError, which is one, when it
-    holds less than a manifest says, or something else.
+    Raises BadInputError when the folder holds no store of this format, and its subclass DamagedFramesError when the
+    files differ from the manifest.
     """
     path = folder / "manifest.json"
     try:
@@ -133,7 +134,7 @@ def open_frames(folder: Path, *, check: bool = False) -> FrameStore:
 
 
 def _open_set(folder: Path, entry: dict[str, Any], *, check: bool) -> Frames:
-    remedy = "study.sweep and study.data build make it anew"
+    remedy = "study.sweep and study.data build make it again"
     arrays = {}
     masks = entry["arrays"]["masks"]["shape"][1]
     for name, shape in shapes(masks).items():
@@ -161,7 +162,7 @@ def _open_set(folder: Path, entry: dict[str, Any], *, check: bool) -> Frames:
         rows = slice(part["start"], part["start"] + part["rows"])
         for name, array in arrays.items():
             each = int(np.prod(array.shape[1:]))
-            content = np.fromfile(  # read, not mapped: all of a large store would count as this process's memory
+            content = np.fromfile(  # not mapped: all of a large store would count as this process's memory
                 folder / f"{name}.npy", np.uint8, part["rows"] * each, offset=array.offset + part["start"] * each
             )
             if hashlib.sha256(content.data).hexdigest() != part[name]:

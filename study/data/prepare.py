@@ -23,20 +23,20 @@ Described = tuple[dict[str, Any], dict[str, bytes]]  # a manifest, and files by 
 
 
 def frames_folder(settings: StudySettings, root: Path = DATA, imported: Imported | None = None) -> Path:
-    """Where the frame store of these settings lies, or will lie: of our town's drives, or of the imported ones."""
+    """Return the folder of the frame store of these settings, made or not, of our town's or of imported drives."""
     return root / "frames" / frames_key(settings, imported.key if imported else None)
 
 
 def drives_folder(settings: StudySettings, root: Path = DATA, imported: Imported | None = None) -> Path:
-    """Where the drives behind that frame store lie, or will lie."""
+    """Return the folder of the drives of that frame store, recorded or not."""
     return imported.folder if imported else root / "episodes" / recording_key(settings)
 
 
 def data_flow(settings: StudySettings, root: Path = DATA, imported: Imported | None = None) -> Flow[Path]:
-    """Record and render whatever is missing; returns the frame store's folder.
+    """Record and render whatever is missing, and return the frame store's folder.
 
-    A store that was damaged is made again from its drives, and is what it was. Raises BadInputError when the settings
-    cannot be met, the disk is too small or an imported drive has changed.
+    A damaged store is made again from its drives. Raises BadInputError when the settings cannot be met, the disk is
+    too small or an imported drive has changed.
     """
     folder = frames_folder(settings, root, imported)
     # Imported here: planning needs no arrays, and frames that exist can be studied on a machine without the simulator.
@@ -67,9 +67,9 @@ def data_flow(settings: StudySettings, root: Path = DATA, imported: Imported | N
 
 
 def drives_flow(settings: StudySettings, root: Path = DATA) -> Flow[list[Path]]:
-    """Record the drives of our town that are missing, and return all; the simulator is loaded for these only.
+    """Record the drives of our town that are missing, and return all.
 
-    Raises BadInputError when the settings cannot be met, or when drives are missing where there is no simulator.
+    Raises BadInputError when the settings cannot be met, or when drives are missing and the simulator is not installed.
     """
     recording, folder = settings.recording, drives_folder(settings, root)
     first, second = recording.seed, recording.seed + POLICY_SEED
@@ -108,19 +108,16 @@ def describe_data(
 
 
 def _check_room(root: Path, need: int, taken: Sequence[Path]) -> None:
-    """Raise BadInputError when `root` has less room than what is to be made; what lies in `taken` is part of that."""
+    """Raise BadInputError when `root` has too little room; files in `taken` are part of the need."""
     try:
         root.mkdir(parents=True, exist_ok=True)
         free = shutil.disk_usage(root).free
     except OSError as error:
         raise BadInputError(f"cannot write to {root}: {error.strerror}; name another working folder") from error
-    need -= sum(map(_held, taken))  # what a killed command has taken is not free
+    # What a killed command has written is not free.
+    need -= sum(path.stat().st_blocks * 512 for folder in taken for path in folder.rglob("*") if path.is_file())
     if need > free:
         raise BadInputError(
             f"{root} has {size(free)} free and the data needs about {size(need)}: "
             "free some room, or lower --frames.encoder and --recording.encoder_episodes"
         )
-
-
-def _held(folder: Path) -> int:
-    return sum(path.stat().st_blocks * 512 for path in folder.rglob("*") if path.is_file())

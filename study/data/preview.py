@@ -1,7 +1,7 @@
-"""Preview: a contact sheet of frames with their targets and labels, and one drive in motion.
+"""Preview: a contact sheet of frames with their targets and labels, and a film of one drive.
 
 Both lie beside the frames, in `preview/`: `contact.png` shows training frames of both sets; `drive.gif` follows one
-vehicle of one drive, in real time, in bird view as the encoder sees it and on the map of the whole town.
+vehicle in real time, in the bird view that the encoder sees and on the map of the town.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ Pixels = NDArray[np.float64]
 
 
 def write_preview(store: FrameStore, drives: Sequence[Path], folder: Path) -> tuple[Path, ...]:
-    """Write both files below `folder`, whole or not at all, and return them; the film is of the first of `drives`.
+    """Write both files below `folder`, atomically, and return them; the film shows the first of `drives`.
 
     Raises BadInputError when there is no drive or it cannot be read.
     """
     if not drives:
         raise BadInputError(
-            f"none of the drives that {folder} was made from is there any more: "
-            "delete that folder and build it again, then the drives are recorded too"
+            f"none of the drives that {folder} was made from exists any more: "
+            "delete that folder and build it again; this records the drives, too"
         )
     birdview = BirdviewSettings.model_validate(store.manifest["settings"]["birdview"])
     with atomic_folder(folder / "preview") as draft:
@@ -60,7 +60,7 @@ def write_preview(store: FrameStore, drives: Sequence[Path], folder: Path) -> tu
 
 
 def sample(frames: Frames, seed: int, count: int = SHOWN) -> list[tuple[str, NDArray[np.uint8]]]:
-    """Random training frames: label in words, and input, pred and plan as [3, 64, 64, 3] uint8."""
+    """Return random training frames: label in words, and input and masks as [1 + K, 64, 64, 3] uint8."""
     rows = np.sort(np.random.default_rng([seed]).permutation(frames.indices("train"))[:count])
     masks = np.repeat(unpack_masks(frames.masks[rows])[..., None] * np.uint8(255), 3, axis=4)
     pictures = np.concatenate([frames.images[rows][:, None], masks], axis=1)
@@ -68,7 +68,7 @@ def sample(frames: Frames, seed: int, count: int = SHOWN) -> list[tuple[str, NDA
 
 
 def label_text(frames: Frames, row: int) -> str:
-    """The labels of a frame in two short lines."""
+    """Return the labels of a frame in two short lines."""
     label = frames.labels.iloc[row]
     light = ("no red light", "yellow", "red")[int(label["light"])]
     light += f" in {label['light_distance']:.0f} m" if label["light"] else ""
@@ -81,23 +81,25 @@ def label_text(frames: Frames, row: int) -> str:
 
 
 def choose_ego(episode: Episode) -> tuple[int, NDArray[np.int64]]:
-    """The vehicle to follow, as an agent index, and its steps: there the longest, then past most lights, then farthest.
+    """Return index and steps of the vehicle that is present longest, then passes most lights, then goes farthest.
 
     Raises BadInputError when no vehicle may be ego.
     """
     most = round(SECONDS * episode.rate_hz)
-    best: tuple[tuple[float, ...], int] | None = None
-    for index, agent in enumerate(episode.agents):
-        steps = np.flatnonzero(episode.present[:, index])[:most]
-        if not agent.ego or not len(steps):
-            continue
-        lights = np.count_nonzero(np.diff(episode.light[steps, index]))
-        score = (len(steps), float(lights), float(np.abs(episode.speed[steps, index]).sum()))
-        if best is None or score > best[0]:
-            best = (score, index)
-    if best is None:
-        raise BadInputError(f"Episode {episode.id} has no vehicle that may be ego; take another drive")
-    return best[1], np.flatnonzero(episode.present[:, best[1]])[:most:EVERY]
+    steps = {
+        index: np.flatnonzero(episode.present[:, index])[:most]
+        for index, agent in enumerate(episode.agents)
+        if agent.ego and episode.present[:, index].any()
+    }
+    if not steps:
+        raise BadInputError(f"Episode {episode.id} has no vehicle that may be ego; choose another drive")
+
+    def score(index: int) -> tuple[float, ...]:
+        at = steps[index], index
+        return len(at[0]), float(np.count_nonzero(np.diff(episode.light[at]))), float(np.abs(episode.speed[at]).sum())
+
+    ego = max(steps, key=score)
+    return ego, steps[ego][::EVERY]
 
 
 def write_film(episode: Episode, birdview: BirdviewSettings, path: Path) -> None:
@@ -108,11 +110,8 @@ def write_film(episode: Episode, birdview: BirdviewSettings, path: Path) -> None
         _frame(view, picture, episode, ego, step)
         for view, picture, step in zip(views, _maps(episode, birdview, ego, steps), steps.tolist(), strict=True)
     ]
-    some = frames[:: max(len(frames) // 8, 1)]
-    sheet = Image.new("RGB", (some[0].width, some[0].height * len(some)))
-    for number, frame in enumerate(some):
-        sheet.paste(frame, (0, number * frame.height))
-    palette = sheet.quantize(COLOURS)
+    few = np.concatenate([np.asarray(frame) for frame in frames[:: max(len(frames) // 8, 1)]])
+    palette = Image.fromarray(few).quantize(COLOURS)
     flat = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     flat[0].save(
         path,
@@ -125,11 +124,11 @@ def write_film(episode: Episode, birdview: BirdviewSettings, path: Path) -> None
 
 
 def _frame(view: NDArray[np.uint8], chart: Image.Image, episode: Episode, ego: int, step: int) -> Image.Image:
-    """Bird view and words on the left, map on the right."""
+    """Return a frame of the film: bird view and words on the left, map on the right."""
     left = IMAGE * LARGER
-    whole = Image.new("RGB", (left + GAP + SIDE, SIDE), GROUND)
-    whole.paste(Image.fromarray(view.repeat(LARGER, axis=0).repeat(LARGER, axis=1)), (0, 0))
-    whole.paste(chart, (left + GAP, 0))
+    frame = Image.new("RGB", (left + GAP + SIDE, SIDE), GROUND)
+    frame.paste(Image.fromarray(view.repeat(LARGER, axis=0).repeat(LARGER, axis=1)), (0, 0))
+    frame.paste(chart, (left + GAP, 0))
     steering, command = episode.steering[step, ego], episode.acceleration[step, ego]
     words = (
         f"drive {episode.id}, vehicle {episode.agents[ego].id}\n"
@@ -138,14 +137,14 @@ def _frame(view: NDArray[np.uint8], chart: Image.Image, episode: Episode, ego: i
         "map: the vehicle of the picture above\n(blue) with its route, which is red\nwhere its light is not green"
     )
     font = ImageFont.load_default(13)
-    ImageDraw.Draw(whole).multiline_text((GAP, left + GAP), words, fill=TEXT, font=font, spacing=5)
-    return whole
+    ImageDraw.Draw(frame).multiline_text((GAP, left + GAP), words, fill=TEXT, font=font, spacing=5)
+    return frame
 
 
 def _maps(episode: Episode, birdview: BirdviewSettings, ego: int, steps: NDArray[np.int64]) -> Iterator[Image.Image]:
-    """The whole map at each step: roads, lights, the ego's route from where it is on, vehicles."""
-    there = episode.present
-    points = [lane.centre for lane in episode.lanes] or [np.stack([episode.x[there], episode.y[there]], axis=1)]
+    """Yield the map at each step: roads, lights, the way ahead of the ego, vehicles."""
+    present = episode.present
+    points = [lane.centre for lane in episode.lanes] or [np.stack([episode.x[present], episode.y[present]], axis=1)]
     low, high = (np.asarray(end(np.concatenate(points), axis=0), float) for end in (np.min, np.max))
     scale = (SIDE - 3 * GAP) / max(float((high - low).max()), 1.0)
     shift = np.array([SIDE / 2, SIDE / 2]) - scale * np.array([1, -1]) * (low + high) / 2
@@ -167,7 +166,7 @@ def _maps(episode: Episode, birdview: BirdviewSettings, ego: int, steps: NDArray
             draw.line(pixels(way), LIGHTS[0] if state == GREEN else LIGHTS[2], 2)
         for (x, y), colour in zip(lamps, episode.light_state[step].tolist(), strict=True):
             draw.ellipse((x - 2, y - 2, x + 2, y + 2), fill=LIGHTS[colour])
-        for index in np.flatnonzero(there[step]).tolist():
+        for index in np.flatnonzero(present[step]).tolist():
             draw.polygon(pixels(_box(episode, step, index, 5.0 / scale)), EGO if index == ego else OTHERS)
         ((x, y),) = pixels(np.array([[episode.x[step, ego], episode.y[step, ego]]]))
         draw.ellipse((x - 9, y - 9, x + 9, y + 9), outline=EGO, width=2)
@@ -175,7 +174,7 @@ def _maps(episode: Episode, birdview: BirdviewSettings, ego: int, steps: NDArray
 
 
 def _box(episode: Episode, step: int, index: int, least: float) -> Pixels:
-    """Corners [4, 2] m of a vehicle, drawn at least `least` [m] long and half as wide: a dot has no direction."""
+    """Return the corners [4, 2] [m] of a vehicle, at least `least` [m] long, so that its direction shows."""
     agent, heading = episode.agents[index], episode.heading[step, index]
     along = np.array([np.cos(heading), np.sin(heading)]) * max(agent.length, least) / 2
     across = np.array([-np.sin(heading), np.cos(heading)]) * max(agent.width, least / 2) / 2
@@ -186,7 +185,7 @@ def _box(episode: Episode, step: int, index: int, least: float) -> Pixels:
 
 
 def _way_ahead(episode: Episode, ego: int, step: int) -> Pixels:
-    """The rest [P, 2] m of the ego's route; nothing where route or progress is unknown."""
+    """Return the rest [P, 2] [m] of the ego's route, empty where route or progress is unknown."""
     route, progress = episode.routes[ego].astype(float), float(episode.route_s[step, ego])
     if len(route) < 2 or not np.isfinite(progress):
         return np.empty((0, 2))

@@ -1,8 +1,8 @@
-"""Selection: which recorded moments become frames, in which split (Sec. IV-A, V; PAPER.md 2.7 to 2.9).
+"""Selection: which recorded moments become frames, in which split (Sec. IV-A, V; docs/paper.md).
 
-Of each drive come candidates: moments of one vehicle at least `spacing` apart. From the candidates of all drives the
-frames are drawn without replacement: by chance for the encoder set, and for the policy set raked, so that steering
-bins, acceleration classes and standing vehicles have the shares that the settings name (PROTOTYPE.md).
+Each drive gives candidates: moments of one vehicle at least `spacing` apart. From the candidates of all drives the
+frames are drawn without replacement: uniformly for the encoder set, and raked for the policy set, so that steering
+bins, acceleration classes and standing vehicles have the shares that the settings name.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from study.episode.schema import RATE_HZ
 from study.errors import BadInputError
 
 SETS = ("encoder", "policy")
-STEERING_EDGES = (-0.15, -0.05, -0.01, 0.01, 0.05, 0.15)  # of the bins that the policy set is raked to (PROTOTYPE.md)
+STEERING_EDGES = (-0.15, -0.05, -0.01, 0.01, 0.05, 0.15)  # of the bins that the policy set is raked to
 STANDING = 0.1  # [m/s], below it a vehicle stands
 
 LABELS: dict[str, type[np.generic]] = {
@@ -46,9 +46,9 @@ Columns = dict[str, NDArray[Any]]
 
 
 def candidates(path: Path, number: int, name: str, frames: FramesSettings, birdview: BirdviewSettings) -> Columns:
-    """Label columns of one drive's candidate moments; runs in a worker.
+    """Return the label columns of one drive's candidate moments.
 
-    Of each vehicle every k-th moment is taken, k the spacing, from a random one on; for the encoder set a standing
+    Every k-th moment of each vehicle is taken, k the spacing, from a random one on; for the encoder set a standing
     moment is kept with probability `standing_weight`.
     """
     episode = read_episode(path)
@@ -81,7 +81,7 @@ def candidates(path: Path, number: int, name: str, frames: FramesSettings, birdv
 def choose(
     columns: Columns, name: str, wanted: int, drives: int, settings: FramesSettings
 ) -> tuple[Indices, NDArray[np.bool_], list[int]]:
-    """Rows of the chosen candidates, sorted; which of them are for training; the test drives (Sec. V, PAPER.md 2.8)."""
+    """Return the rows of the chosen candidates, sorted, whether each is for training, and the test drives (Sec. V)."""
     rng = np.random.default_rng([settings.seed, _CHOICE, SETS.index(name)])
     test = round(wanted * settings.test_share)
     balance = settings.balance if name == "policy" else "none"
@@ -111,7 +111,7 @@ def _sample(
     settings: FramesSettings,
     rng: np.random.Generator,
 ) -> Indices:
-    """`wanted` rows of the pool without replacement, sorted; raked to the target margins unless `balance` is none."""
+    """Draw `wanted` rows of the pool without replacement, sorted; raked to the targets unless `balance` is none."""
     if wanted > len(pool):
         raise BadInputError(
             f"the {name} set needs {wanted}{split} frames and its drives give {len(pool)}: lower "
@@ -132,7 +132,7 @@ def _sample(
 def _cells(
     columns: Columns, pool: Indices, balance: str, settings: FramesSettings
 ) -> tuple[NDArray[np.intp], tuple[int, ...], dict[int, NDArray[np.float64]]]:
-    """Cell number of each row in (steering bin, class, standing), the cells' shape, and target shares by axis."""
+    """Return the cell of each row in (steering bin, class, standing), the cells' shape, and target shares by axis."""
     shape = (len(STEERING_EDGES) + 1, len(ACCELERATIONS), 2)
     bins = np.digitize(columns["steering"][pool], STEERING_EDGES)
     cell = np.ravel_multi_index((bins, columns["acceleration"][pool], columns["standing"][pool].astype(int)), shape)
@@ -148,10 +148,10 @@ def _cells(
 def rake(
     available: NDArray[np.integer[Any]], margins: dict[int, NDArray[np.float64]], wanted: int, cap: float
 ) -> NDArray[np.int64]:
-    """How many to take of each cell's `available` so that `wanted` come as near to the target margins as they can.
+    """Return how many of each cell's `available` to take, so that `wanted` come nearest to the target margins.
 
-    Iterative proportional fitting, where no cell gives more than it has or more than `cap` times its proportional
-    share. `margins`: axis -> shares along it. Raises BadInputError when the cap leaves too few.
+    This is iterative proportional fitting in which no cell gives more than it has, or more than `cap` times its
+    proportional share. `margins`: axis -> shares along it. Raises BadInputError when the cap leaves too few.
     """
     proportional = available * (wanted / max(int(available.sum()), 1))
     most = np.minimum(available, np.ceil(cap * proportional))
@@ -170,15 +170,15 @@ def rake(
     left = most - counts
     if left.sum() > 0:
         counts += left * (max(wanted - counts.sum(), 0) / left.sum())
-    whole: NDArray[np.int64] = np.floor(counts + 1e-9).astype(np.int64)
-    missing = wanted - int(whole.sum())
-    rest = np.where(whole < most, counts - whole, -1.0).reshape(-1)
-    whole.reshape(-1)[np.argsort(-rest, kind="stable")[:missing]] += 1
-    return whole
+    rounded: NDArray[np.int64] = np.floor(counts + 1e-9).astype(np.int64)
+    missing = wanted - int(rounded.sum())
+    rest = np.where(rounded < most, counts - rounded, -1.0).reshape(-1)
+    rounded.reshape(-1)[np.argsort(-rest, kind="stable")[:missing]] += 1
+    return rounded
 
 
 def histograms(columns: Columns, rows: NDArray[np.bool_]) -> dict[str, Any]:
-    """What a reader must know of a set's labels: histograms, and the accuracy of always saying the commonest class."""
+    """Return histograms of a set's labels, and the accuracy of always saying the commonest class."""
     steering, standing = columns["steering"][rows], columns["standing"][rows]
     classes = np.bincount(columns["acceleration"][rows], minlength=len(ACCELERATIONS))
     number = max(int(rows.sum()), 1)

@@ -1,8 +1,8 @@
-"""The true state in the place of a latent: what policies reach that need no encoder, a ceiling for those that do.
+"""The true state in place of a latent: a ceiling for what policies can learn from an encoder.
 
 It holds what the expert decides its acceleration by and the image shows (Sec. III-A, IV-C): speed, now and over the
-past second, the light that governs and the way to its stop line, the gap to the vehicle ahead. The speed limit is one
-number for the whole town. There is no route in it, so as a ceiling it is good for acceleration only.
+past second, the governing light and the distance to its stop line, the gap to the vehicle ahead. The speed limit is
+one number for the whole town. The route is not in it, so it is a ceiling for acceleration only.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from study.episode.files import episode_digest, read_episode
 from study.errors import BadInputError
 
 PAST = 10  # steps at 10 Hz: the past second
-FAR = 40.0  # [m] the image's side; what is farther away, or not there, is this far
+FAR = 40.0  # [m] the image's side; what is farther away, or absent, counts as this far
 # A small network learns thresholds slowly from one number, so each is spread over this many ramps.
 RAMPS = {"speed": 24, "light_distance": 12, "lead_gap": 12}
 
@@ -27,10 +27,10 @@ Array = NDArray[np.float64]
 
 
 def true_state(labels: pd.DataFrame, sources: Sequence[Mapping[str, str]], drives: Path) -> NDArray[np.float32]:
-    """State [N, 64] of the frames with those labels, z-scored over the training frames; columns not needed are 0.
+    """Return the state [N, 64] of frames with these labels, z-scored over the training frames, padded with 0.
 
     `sources` lists the set's drives, name and digest, as a frame store's manifest does; they lie in `drives`.
-    Raises BadInputError when a drive is not there or not the same.
+    Raises BadInputError when a drive is missing or has changed.
     """
     train = labels["train"].to_numpy()
     own = {name: labels[name].to_numpy(np.float64) for name in RAMPS}
@@ -48,19 +48,19 @@ def true_state(labels: pd.DataFrame, sources: Sequence[Mapping[str, str]], drive
 
 
 def _ramps(values: Array, high: float, count: int) -> Array:
-    """[N, count]: which part of each of `count` equal stretches from 0 to `high` a value has covered."""
+    """Return [N, count]: the part of each of `count` equal stretches from 0 to `high` that a value covers."""
     return np.clip(values[:, None] * (count / max(high, 1e-9)) - np.arange(count), 0, 1)
 
 
 def _past_speed(labels: pd.DataFrame, sources: Sequence[Mapping[str, str]], drives: Path) -> Array:
-    """Speed 1 to PAST steps before each frame [N, PAST]; what was not recorded counts as unchanged."""
+    """Return the speed 1 to PAST steps before each frame [N, PAST]; an unrecorded speed counts as unchanged."""
     past = np.empty((len(labels), PAST))
     for number, rows in labels.reset_index(drop=True).groupby("episode"):
         source = sources[int(str(number))]
         folder = drives / Path(source["name"]).name
         if not (folder / "episode.json").is_file() or episode_digest(folder) != source["digest"]:
             raise BadInputError(
-                f"the ceiling needs the drives that the frames were made from, and {folder} is not there or another; "
+                f"the ceiling needs the drives that the frames were made from, and {folder} is missing or has changed; "
                 "delete the frame store to make both again, or leave the ceiling out with --ceiling false"
             )
         episode = read_episode(folder)

@@ -1,7 +1,7 @@
-"""A trained cell as one network, images in and every policy's answer out, exported to a file without pickle.
+"""A trained cell as one network, from images to the commands of every policy, exported to a file without pickle.
 
-The file is torch.export's archive: raw tensors and a graph of torch's own operations as JSON. It needs torch alone to
-run, none of this program, and it cannot carry code; a pickled module, MLflow's other format, can.
+The file is torch.export's archive: raw tensors and a graph of torch's own operations as JSON. It needs only torch to
+run, and it cannot carry code, as a pickled module can.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class Driver(nn.Module):
     """An encoder and the S policies on it.
 
     Images [B, 3, 64, 64] float32 in [0, 1] -> "steering" [S, B] and "acceleration" [S, B, 3] float32, the logits of the
-    classes ACCELERATIONS. Policies speak without dropout.
+    classes ACCELERATIONS, without dropout.
     """
 
     def __init__(self, encoder: Mapping[str, NDArray[Any]], policies: Mapping[str, NDArray[Any]]) -> None:
@@ -37,11 +37,11 @@ class Driver(nn.Module):
                 self.register_buffer(name, torch.from_numpy(np.array(value)))
 
     def forward(self, images: Tensor) -> dict[str, Tensor]:
-        """What the policies say of images."""
+        """Return the commands of all policies for images."""
         z = (self.encoder(images) - self.get_buffer("z_mean")) / self.get_buffer("z_std")
         if self.unit_length:
             z = nn.functional.normalize(z, dim=1, eps=torch.finfo(z.dtype).tiny)
-        said = {
+        outputs = {
             name: through(
                 [
                     (self.get_buffer(f"{name}_{layer}_weight"), self.get_buffer(f"{name}_{layer}_bias")[:, None])
@@ -51,11 +51,11 @@ class Driver(nn.Module):
             )
             for name, widths in WIDTHS.items()
         }
-        return {"steering": said["steering"][..., 0], "acceleration": said["acceleration"]}
+        return {"steering": outputs["steering"][..., 0], "acceleration": outputs["acceleration"]}
 
 
 def export_driver(result: CellResult) -> bytes:
-    """Return the cell's Driver as a .pt2 archive that takes batches of any size. About a second's work."""
+    """Return the cell's Driver as a .pt2 archive that takes batches of any size, in about a second."""
     driver = Driver(result.encoder, result.policies).eval()
     images = to_float(torch.from_numpy(result.samples["input"][:1])).repeat(2, 1, 1, 1)  # one would become a constant
     with torch.no_grad():
