@@ -74,8 +74,12 @@ def test_the_share_of_the_possible_gain_stands_beside_with_floor_and_ceiling(pai
     assert row(text, "full")[5:] == [f"{100 * share:.0f}" for share in shares]
     assert row(text, "*ceiling (true state)*")[1:3] == [f"{100 * one.ceiling.mean:.2f} (15)" for one in pair]
     assert row(text, "*ceiling (true state)*")[5:] == ["100", "100"]
-    assert row(text, "*floor (commonest class)*")[1:3] == [f"{100 * one.floor['accuracy']:.2f}" for one in pair]
-    assert row(text, "*floor (best constant command)*")[1:3] == [f"{1e3 * one.floor['steering']:.3f}" for one in pair]
+    assert row(text, "*floor (commonest class)*")[1:3] == [
+        f"{100 * one.floor['acceleration_accuracy']:.2f}" for one in pair
+    ]
+    assert row(text, "*floor (best constant command)*")[1:3] == [
+        f"{1e3 * one.floor['steering_loss']:.3f}" for one in pair
+    ]
 
 
 def test_a_report_without_a_ceiling_or_of_a_time_before_it_is_compared_without_shares(content):

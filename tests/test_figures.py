@@ -1,5 +1,6 @@
 import math
 import xml.etree.ElementTree as ET
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,8 +10,12 @@ from study.config.grid import Grid
 from study.config.heads import HEAD_SETS
 from study.errors import BadInputError
 from study.figures import curves, differences, pictures, style
+from study.report.comparison import compare
+from study.report.document import Picture
 from study.report.drawings import draw, draw_sweeps
+from study.report.markdown import markdown
 from study.report.summary import summarise
+from study.report.text import document
 from tests.support.synthetic_records import DATASIZE_GRID, HEADS_GRID, World, simulate
 
 
@@ -37,19 +42,22 @@ def luminance(colour):
     return np.dot([0.2126, 0.7152, 0.0722], linear)
 
 
-def test_every_head_set_has_a_colour_a_line_and_a_marker_of_its_own():
-    for marks in (style.COLOUR, style.MARKER):
-        assert set(marks) == set(HEAD_SETS)
-        assert len(set(marks.values())) == len(HEAD_SETS)
-    assert set(style.LINE) == set(HEAD_SETS)
+def test_every_head_set_has_a_colour_and_a_marker_of_its_own():
+    for mark in ("colour", "marker"):
+        assert len({getattr(style.look(name), mark) for name in HEAD_SETS}) == len(HEAD_SETS)
+
+
+def test_a_head_set_that_no_record_names_has_a_look_of_its_own():
+    other = style.look("rec+weather")
+    assert other == style.look("rec+weather")
+    assert other.colour not in {style.look(name).colour for name in HEAD_SETS}
 
 
 def test_head_sets_of_similar_grey_differ_in_line_style():
-    for first in HEAD_SETS:
-        for second in HEAD_SETS:
-            similar = abs(luminance(style.COLOUR[first]) - luminance(style.COLOUR[second])) < 0.1
-            if first < second and similar:
-                assert style.LINE[first] != style.LINE[second]
+    for first in map(style.look, HEAD_SETS):
+        for second in map(style.look, HEAD_SETS):
+            if first.name < second.name and abs(luminance(first.colour) - luminance(second.colour)) < 0.1:
+                assert first.line != second.line
 
 
 def test_curves_are_labelled_directly_and_axes_have_units(heads_figure):
@@ -148,17 +156,34 @@ ENCODERS_GRID = HEADS_GRID.model_copy(update={"heads": ("rec", "full"), "encoder
 )
 def test_a_sweep_gets_every_figure_of_the_paper_with_n_in_the_caption(grid, names):
     record = simulate(grid, World(epochs=12))
-    drawings = {drawing.name: drawing for drawing in draw(record, summarise(record))}
-    assert names <= set(drawings)
+    report = summarise(record)
+    report = report.model_copy(update={"figures": tuple(draw(record, report))})
+    shown = {Path(item.file).stem: item for item in document(report) if isinstance(item, Picture)}
+    assert set(shown) == set(report.figures)
+    assert names <= set(shown)
     for name in names - {"single_head_rec", "multi_results", "latent_maps", "all_head_sets"}:
-        expected = "n = 3 encoders x 5 policies" if name == "by_encoder" else "n = 15 policies"
-        assert expected in drawings[name].caption
-    assert all(drawing.alt for drawing in drawings.values())
+        assert ("n = 3 encoders" if name == "by_encoder" else "n = 15 policies") in shown[name].caption
+    assert all(item.alt for item in shown.values())
+
+
+def test_a_head_set_that_no_record_names_is_in_every_figure_and_table():
+    """A fifth set from another machine's report, say, takes no claim and no figure away."""
+    world = World(epochs=8)
+    world.accuracy["rec+weather"] = 0.9
+    grid = HEADS_GRID.model_copy(update={"heads": ("rec+weather", *HEADS_GRID.heads)})
+    record = simulate(grid, world)
+    report = summarise(record)
+    assert [score.heads for score in report.scores] == [*HEAD_SETS, "rec+weather"]
+    assert {claim.outcome for claim in report.claims} <= {"reproduced", "not reproduced", "inconclusive"}
+    drawn = draw(record, report)
+    assert "rec+weather" in texts(drawn["test_compare_heads"])
+    assert "rec+weather" in markdown(compare(report, report, ("a", "b")))
+    assert "rec+weather" in texts(draw_sweeps(report, report, SIDES))
 
 
 def test_multi_results_shows_inputs_outputs_and_targets():
     record = simulate(HEADS_GRID, World(epochs=12))
-    figure = next(d.figure for d in draw(record, summarise(record)) if d.name == "multi_results")
+    figure = draw(record, summarise(record))["multi_results"]
     assert [text.get_text() for text in figure.texts] == [
         "input",
         "reconstruction",
@@ -200,7 +225,7 @@ def marks(axes):
 
 
 def test_two_sweeps_differ_by_marker_and_fill_and_share_the_head_sets_colours(two, reports):
-    left, right = two.figure.axes
+    left, right = two.axes
     expected = {
         (round(100 * score.accuracy.mean, 6), *mark)
         for report, mark in zip(reports, (("o", True), ("D", False)), strict=True)
@@ -210,16 +235,16 @@ def test_two_sweeps_differ_by_marker_and_fill_and_share_the_head_sets_colours(tw
     gains = {
         (round(100 * report.above_baseline(point).value, 6), *mark)
         for report, mark in zip(reports, (("o", True), ("D", False)), strict=True)
-        for point in report.points
+        for point in report.by_point
         if point[0] != "rec"
     }
     assert marks(right) == gains
     coloured = {line.get_color() for line in left.lines if line.get_marker() in ("o", "D")}
-    assert coloured == set(style.COLOUR.values())
+    assert coloured == {style.look(name).colour for name in HEAD_SETS}
 
 
 def test_two_sweeps_have_a_row_for_each_head_set_and_fraction_and_a_bar_for_each_interval(two, reports):
-    left, right = two.figure.axes
+    left, right = two.axes
     names = [label.get_text() for label in left.get_yticklabels()]
     assert names[:5] == ["rec at 100 %", "rec+pred at 100 %", "rec+plan at 100 %", "full at 100 %", "rec at 50 %"]
     assert len(names) == 12
@@ -231,7 +256,7 @@ def test_two_sweeps_have_a_row_for_each_head_set_and_fraction_and_a_bar_for_each
 
 def test_numbers_of_two_sweeps_do_not_touch_and_stay_inside_the_picture(reports):
     other = reports[0].model_copy(update={"sweep": reports[0].sweep.model_copy(update={"name": "again"})})
-    figure = draw_sweeps(reports[0], other, SIDES).figure
+    figure = draw_sweeps(reports[0], other, SIDES)
     figure.canvas.draw()
     for axes in figure.axes:
         boxes = [text.get_window_extent() for text in axes.texts]
@@ -242,14 +267,15 @@ def test_numbers_of_two_sweeps_do_not_touch_and_stay_inside_the_picture(reports)
 
 
 def test_words_beside_two_sweeps_say_n_kind_floor_ceiling_and_which_is_which(two, reports):
-    for words in (two.caption, " ".join(texts(two.figure)).replace(r"\$", "$")):
+    (shown,) = (item for item in compare(*reports, SIDES, "two.svg") if isinstance(item, Picture))
+    for words in (shown.caption.replace("\\", ""), " ".join(texts(two)).replace(r"\$", "$")):
         assert "first, reports/first (n = 15 policies on one encoder)" in words
         assert "second, the $second$_one (n = 15 policies on one encoder)" in words
-    assert "95 % interval (BCa" in two.caption
-    assert "difference to rec of the same sweep" in two.caption
-    floors = " and ".join(f"{100 * report.floor['accuracy']:.1f}" for report in reports)
-    assert any(f"axis cut; majority class at {floors} %; true state at" in text for text in texts(two.figure))
-    assert f"rec+pred at 100 %: {100 * reports[0].scores[1].accuracy.mean:.1f} % and none" in two.alt
+    assert "95 % interval (BCa" in shown.caption
+    assert "difference to rec of the same sweep" in shown.caption
+    floors = " and ".join(f"{100 * report.floor['acceleration_accuracy']:.1f}" for report in reports)
+    assert any(f"axis cut; majority class at {floors} %; true state at" in text for text in texts(two))
+    assert f"rec+pred at 100 %: {100 * reports[0].scores[1].accuracy.mean:.1f} % and none" in shown.alt
 
 
 def test_one_score_without_interval_is_drawn_and_no_score_is_refused(tmp_path):
@@ -257,13 +283,12 @@ def test_one_score_without_interval_is_drawn_and_no_score_is_refused(tmp_path):
     one = report_of(grid)
     assert math.isnan(one.scores[0].accuracy.low)
     drawing = draw_sweeps(one, one, ("a" * 200, "b"))
-    style.write(drawing.figure, tmp_path / "one.png")
-    (axes,) = drawing.figure.axes
+    style.write(drawing, tmp_path / "one.png")
+    (axes,) = drawing.axes
     assert not any(
         math.isfinite(x) for bars in axes.collections for path in bars.get_paths() for x in path.vertices[:, 0]
     )
     assert len(marks(axes)) == 2
-    assert "difference" not in drawing.caption
     empty = one.model_copy(update={"scores": ()})
     with pytest.raises(BadInputError, match="no cell is finished in a or b"):
         draw_sweeps(empty, empty, ("a", "b"))

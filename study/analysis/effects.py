@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -48,6 +49,17 @@ class Contrast:
     episodes: Interval | None
 
 
+def ordered(heads: Iterable[str]) -> list[str]:
+    """Return head sets in the order of every table: those of `HEAD_SETS`, then others as they come."""
+    names = list(dict.fromkeys(heads))
+    return sorted(names, key=[*HEAD_SETS, *names].index)
+
+
+def points(grid: Grid) -> list[Point]:
+    """Return head sets and fractions of a grid: most data first, head sets in their order."""
+    return [(name, fraction) for fraction in sorted(grid.fractions, reverse=True) for name in ordered(grid.heads)]
+
+
 def label(point: Point, grid: Grid) -> str:
     """Return a cell's name for people, with the fraction only where the sweep has several."""
     heads, fraction = point
@@ -61,7 +73,7 @@ def difference_label(first: Point, second: Point, grid: Grid) -> str:
 
 def planned(grid: Grid) -> list[tuple[Point, Point]]:
     """Return the study's contrasts: head sets against each other at each fraction, and little data against much."""
-    heads = [name for name in HEAD_SETS if name in grid.heads]
+    heads = ordered(grid.heads)
     fractions = sorted(grid.fractions, reverse=True)
     contrasts = [
         ((second, fraction), (first, fraction))

@@ -9,3 +9,4 @@ DEFAULT_TRACKING = "sqlite:///mlruns/mlflow.db"
 
 
 DATA = Path("data")
+REPORTS = Path("reports")

@@ -15,7 +15,8 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from study.figures.style import COLOUR, FRACTION_COLOUR, FRACTION_MARKER, GREY, LINE, MARKER, STYLE, new_figure
+from study.config.heads import HeadSet
+from study.figures.style import FRACTION_COLOUR, FRACTION_MARKER, GREY, STYLE, look, new_figure
 
 CEILING_LINE, CEILING_WORDS = ":", "true state"
 LATE = 0.05  # share of the epochs after which the axis of a curve shows everything
@@ -39,8 +40,8 @@ def compare_heads(
     for axes, bands, scale in zip(panels, (steering, accuracy), (1000.0, 100.0), strict=True):
         ends = []
         for index, (name, rows) in enumerate(bands.groupby("heads", sort=False)):
-            heads = str(name)
-            ends.append(_curve(axes, rows, scale, heads, COLOUR[heads], LINE[heads], MARKER[heads], index))
+            heads = look(str(name))
+            ends.append(_curve(axes, rows, scale, heads.name, heads.colour, heads.line, heads.marker, index))
         if axes is panels[0]:
             axes.set_title(f"(a) Steering loss, {split}")
             _loss_axis(axes, bands, steering_floor)
@@ -74,8 +75,8 @@ def converge_speed(
         colour, marker = (marks[index % len(marks)] for marks in (FRACTION_COLOUR, FRACTION_MARKER))
         ends.append(_curve(axes, rows, 100.0, f"full, {_percent(fraction)}", colour, "-", marker, index))
         colours[float(str(fraction))] = colour
-    words = f"{baseline}, {_percent(top)}"
-    ends.append(_curve(axes, base, 100.0, words, COLOUR[baseline], "--", MARKER[baseline], 0))
+    heads = look(baseline)
+    ends.append(_curve(axes, base, 100.0, f"{baseline}, {_percent(top)}", heads.colour, "--", heads.marker, 0))
     _accuracy_axis(axes, pd.concat([others, base]), accuracy_floor, _top(ceiling))
     goal = 100 * float(base["mean"].iloc[-5:].mean())
     axes.axhline(goal, color=GREY, linewidth=0.6, linestyle=":")
@@ -206,8 +207,8 @@ def compare_fractions(
     for axes, metric, scale in zip(panels, metrics, (1000.0, 100.0), strict=True):
         own, ends = scores[scores["metric"] == metric], []
         for index, (name, rows) in enumerate(own.groupby("heads", sort=False)):
-            heads, points = str(name), rows.sort_values("fraction")
-            ends.append((scale * float(points["mean"].iloc[-1]), heads, COLOUR[heads]))
+            heads, points = look(str(name)), rows.sort_values("fraction")
+            ends.append((scale * float(points["mean"].iloc[-1]), heads.name, heads.colour))
             _bars(axes, points, scale, heads, shift=1 + 0.03 * index)
         ticks = sorted(own["fraction"].unique())
         axes.set(xscale="log", xlabel="share of the encoder's training data [%]")
@@ -227,9 +228,8 @@ def compare_fractions(
     return figure
 
 
-def _bars(axes: Axes, rows: pd.DataFrame, scale: float, heads: str, shift: float) -> None:
+def _bars(axes: Axes, rows: pd.DataFrame, scale: float, heads: HeadSet, shift: float) -> None:
     x, mean, sd, low, high = (rows[name].to_numpy(np.float64) for name in ("fraction", "mean", "sd", "low", "high"))
-    colour = COLOUR[heads]
-    axes.plot(x * shift, scale * mean, LINE[heads], color=colour, marker=MARKER[heads])
-    axes.vlines(x * shift, scale * (mean - sd), scale * (mean + sd), color=colour, linewidth=0.7)
-    axes.vlines(x * shift, scale * low, scale * high, color=colour, linewidth=2.2, alpha=0.6)
+    axes.plot(x * shift, scale * mean, heads.line, color=heads.colour, marker=heads.marker)
+    axes.vlines(x * shift, scale * (mean - sd), scale * (mean + sd), color=heads.colour, linewidth=0.7)
+    axes.vlines(x * shift, scale * low, scale * high, color=heads.colour, linewidth=2.2, alpha=0.6)

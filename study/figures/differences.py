@@ -16,7 +16,7 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from study.config.paper import ACCELERATIONS
-from study.figures.style import COLOUR, GREY, MARKER, SIDES, STYLE, literal, new_figure
+from study.figures.style import BLUE, GREY, SIDES, STYLE, VERMILION, literal, look, new_figure
 
 
 @mpl.rc_context(STYLE)
@@ -30,9 +30,9 @@ def differences(rows: Sequence[Mapping[str, float | str]], allowance: float) -> 
     axes.axvspan(-100 * allowance, 100 * allowance, color=GREY, alpha=0.15, linewidth=0)
     value, low, high, least, most = _columns(rows, ("value", "low", "high", "low_all", "high_all"))
     places = np.arange(len(rows))
-    axes.hlines(places, least, most, color=COLOUR["rec+plan"], linewidth=0.8)
-    axes.hlines(places, low, high, color=COLOUR["rec+plan"], linewidth=2.6)
-    axes.plot(value, places, "o", color=COLOUR["rec"], markersize=3.5)
+    axes.hlines(places, least, most, color=BLUE, linewidth=0.8)
+    axes.hlines(places, low, high, color=BLUE, linewidth=2.6)
+    axes.plot(value, places, "o", color="black", markersize=3.5)
     _difference_axes(axes, [str(row["name"]) for row in rows], (len(rows) - 0.4, -0.6))
     return figure
 
@@ -66,12 +66,12 @@ def by_encoder(scores: Mapping[str, Sequence[NDArray[np.float64]]]) -> Figure:
     for heads, encoders in scores.items():
         first = place
         for policies in encoders:
-            axes.plot([place] * len(policies), 100 * policies, MARKER[heads], color=COLOUR[heads], alpha=0.5)
+            axes.plot([place] * len(policies), 100 * policies, look(heads).marker, color=look(heads).colour, alpha=0.5)
             middle = 100 * float(policies.mean())
-            axes.hlines(middle, place - 0.35, place + 0.35, color=COLOUR[heads], linewidth=1.4)
+            axes.hlines(middle, place - 0.35, place + 0.35, color=look(heads).colour, linewidth=1.4)
             place += 1
-        whole = 100 * float(np.mean([policies.mean() for policies in encoders]))
-        axes.hlines(whole, first - 0.5, place - 0.5, color=GREY, linewidth=0.7, linestyle="--")
+        mean = 100 * float(np.mean([policies.mean() for policies in encoders]))
+        axes.hlines(mean, first - 0.5, place - 0.5, color=GREY, linewidth=0.7, linestyle="--")
         ticks.append(((first + place - 1) / 2, heads))
         place += 1
     axes.set_xticks([tick for tick, _ in ticks], [f"{heads}\n(each column an encoder)" for _, heads in ticks])
@@ -105,7 +105,7 @@ def both_values(rows: Sequence[Mapping[str, Any]], setting: str, values: tuple[s
     Each row has name, and here and there with value, low, high (shares, not points).
     """
     figure, (axes,) = new_figure(0.75 + 0.34 * len(rows))
-    colours = COLOUR["rec"], COLOUR["full"]
+    colours = "black", VERMILION
     for side, value, shift, colour, (marker, fill) in zip(
         ("here", "there"), values, (-0.14, 0.14), colours, SIDES, strict=True
     ):
@@ -129,8 +129,8 @@ class Pair:
     label: str
     heads: str
     fraction: float
-    scores: tuple[Range | None, Range | None]
-    differences: tuple[Range | None, Range | None]
+    scores: tuple[Range | None, ...]
+    differences: tuple[Range | None, ...]
 
 
 @mpl.rc_context(STYLE)
@@ -149,7 +149,7 @@ def two_sweeps(rows: Sequence[Pair], names: tuple[str, str], baselines: tuple[st
             axes.axhline(place, color=GREY, alpha=0.25, linewidth=0.4, zorder=0)
             shift = 0.0 if None in row.scores else 0.2
             for found, mark, y in zip(getattr(row, part), SIDES, (place - shift, place + shift), strict=True):
-                _dot(axes, found, y, COLOUR.get(row.heads, GREY), mark, spec)
+                _dot(axes, found, y, look(row.heads).colour, mark, spec)
         axes.set_yticks(places, [literal(row.label) for row in rows] if part == "scores" else [""] * len(rows))
         axes.set_ylim(places[-1] + 0.6, -0.6)
         _without_left_side(axes)
@@ -161,7 +161,7 @@ def two_sweeps(rows: Sequence[Pair], names: tuple[str, str], baselines: tuple[st
         axes.set_title(f"(b) Difference to {literal(' or '.join(dict.fromkeys(baselines)))}")
         axes.set_xlabel("difference in accuracy [percentage points]")
     keys = [
-        Line2D([], [], color=COLOUR["rec"], marker=marker, markerfacecolor=fill or COLOUR["rec"], markersize=4)
+        Line2D([], [], color="black", marker=marker, markerfacecolor=fill or "black", markersize=4)
         for marker, fill in SIDES
     ]
     figure.legend(keys, [literal(name) for name in names], loc="outside upper left")

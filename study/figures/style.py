@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -11,16 +11,16 @@ import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from study.config.heads import HEAD_SETS
+from study.config.heads import HEAD_SETS, HeadSet
 
-COLOUR = {name: head_set.colour for name, head_set in HEAD_SETS.items()}
-LINE = {name: head_set.line for name, head_set in HEAD_SETS.items()}
-MARKER = {name: head_set.marker for name, head_set in HEAD_SETS.items()}
-FRACTION_COLOUR = ("#D55E00", "#E69F00", "#009E73", "#56B4E9", "#CC79A7")
+BLUE, VERMILION = "#0072B2", "#D55E00"
+FRACTION_COLOUR = (VERMILION, "#E69F00", "#009E73", "#56B4E9", "#CC79A7")
+FURTHER = ("#009E73", "#CC79A7", "#56B4E9", "#8C6D1F", "#7A5195")  # for head sets that no record names
 FRACTION_MARKER = ("D", "^", "s", "v", "P")
 LIGHT_COLOUR, LIGHT_WORDS = ("#BBBBBB", "#E69F00", "#D55E00"), ("green or none", "yellow", "red")
 SIDES = (("o", None), ("D", "white"))  # marker and fill of the first of two sweeps, and of the second
 GREY = "#666666"
+Drawing = Figure  # the type, for packages that do not speak to matplotlib
 WIDTH = 6.4  # [in], the report's text width
 STYLE: dict[Any, Any] = {
     "font.size": 7.5,
@@ -50,15 +50,10 @@ METADATA: dict[str, dict[str, None]] = {  # of each format, what would say when 
 }
 
 
-@dataclass(frozen=True)
-class Drawing:
-    """A figure: its file name, where it belongs in the report, what it shows, and the same in words."""
-
-    name: str
-    place: str
-    caption: str
-    alt: str
-    figure: Figure
+def look(name: str) -> HeadSet:
+    """Return the colour, line and marker of a head set; one without a record gets a colour by its name."""
+    colour = FURTHER[zlib.crc32(name.encode()) % len(FURTHER)]
+    return HEAD_SETS.get(name) or HeadSet(name, (), name, colour, ":", "v")
 
 
 def save(figure: Figure, folder: Path, name: str) -> tuple[Path, Path]:

@@ -8,20 +8,13 @@ python -m study.report compare reports/reference/heads heads:laptop@http://127.0
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from study.config.files import named_files
-from study.config.workspace import SWEEPS
+from study.config.workspace import REPORTS, SWEEPS
 from study.console.options import Parser, add_tracking_option, run
-from study.errors import BadInputError, masked
-from study.report.build import REPORTS, complete_cells, publish
-
-if TYPE_CHECKING:  # the command answers --help without the libraries that only a report needs
-    from study.report.document import Picture
-    from study.report.model import Report
+from study.errors import BadInputError
 
 
 def parser() -> Parser:
@@ -69,77 +62,19 @@ def main(args: Sequence[str]) -> int:
         for option, where in (("profile", "within a name: heads:smoke"), ("out", "with --figure FILE or > FILE")):
             if getattr(options, option) is not None:
                 raise BadInputError(f"compare takes no --{option}; give it {where}")
-        print(side_by_side(rest[0], rest[1], options.tracking, options.figure), end="")
-        return 0
-    if options.figure:
+    elif options.figure:
         raise BadInputError(f"--figure {options.figure} is for compare A B; a report has its own in DIR/SWEEP/figures")
+    # --help is answered without the libraries that only a report needs.
+    from study.report import build  # noqa: PLC0415
     from study.tracking.tracker import Tracker  # noqa: PLC0415
 
-    tracker = Tracker(options.tracking)
-    if options.format == "md":
-        from study.report.markdown import markdown  # noqa: PLC0415
-        from study.report.summary import summarise  # noqa: PLC0415
-        from study.report.text import document  # noqa: PLC0415
-
-        print(markdown(document(summarise(complete_cells(tracker, name, options.profile)))), end="")
+    if name == "compare":
+        print(build.side_by_side(rest[0], rest[1], options.tracking, options.figure), end="")
+    elif options.format == "md":
+        print(build.report_as_markdown(Tracker(options.tracking), name, options.profile), end="")
     else:
-        print(publish(tracker, name, options.profile, options.out or REPORTS))
+        print(build.publish(Tracker(options.tracking), name, options.profile, options.out or REPORTS))
     return 0
-
-
-def side_by_side(first: str, second: str, tracking: str, figure: Path | None = None) -> str:
-    """Return two sweeps' comparison as Markdown, each named by a path or as NAME[:PROFILE][@URI].
-
-    Both are drawn into `figure` first, where there is one. Raises BadInputError for what cannot be read or written.
-    """
-    from study.report.comparison import compare  # noqa: PLC0415
-    from study.report.markdown import markdown  # noqa: PLC0415
-
-    if figure:
-        _check_figure(figure)
-    sides, names = (_report(first, tracking), _report(second, tracking)), (masked(first), masked(second))
-    return markdown(compare(*sides, names, _draw(figure, *sides, names) if figure else None))
-
-
-def _check_figure(file: Path) -> None:
-    """Refuse what cannot become a figure, before anything is read."""
-    from study.figures.style import METADATA  # noqa: PLC0415
-
-    if file.suffix[1:].lower() not in METADATA:
-        raise BadInputError(
-            f"--figure {file}: write {', '.join(f'.{kind}' for kind in METADATA)}, chosen by its ending"
-        )
-    if not file.parent.is_dir():
-        raise BadInputError(f"--figure {file}: there is no folder {file.parent}; make it first: mkdir -p {file.parent}")
-    if file.is_dir():
-        raise BadInputError(f"--figure {file} is a folder; name a file in it")
-
-
-def _draw(file: Path, first: Report, second: Report, names: tuple[str, str]) -> Picture:
-    """Draw two sweeps into a file. Returns the picture by its path from the working folder."""
-    from study.figures.style import write  # noqa: PLC0415
-    from study.report.document import Picture, plain  # noqa: PLC0415
-    from study.report.drawings import draw_sweeps  # noqa: PLC0415
-
-    drawing = draw_sweeps(first, second, names)
-    try:
-        write(drawing.figure, file)
-    except OSError as error:
-        raise BadInputError(f"cannot write {file}: {error.strerror}; name another file") from error
-    return Picture(Path(os.path.relpath(file)).as_posix(), plain(drawing.caption), plain(drawing.alt))
-
-
-def _report(source: str, tracking: str) -> Report:
-    from study.report.model import read_report  # noqa: PLC0415
-
-    sweep, _, uri = source.partition("@")
-    if Path(source).exists() or "/" in sweep or sweep.endswith(".json"):
-        return read_report(Path(source))
-    from study.report.summary import summarise  # noqa: PLC0415
-    from study.tracking.tracker import Tracker  # noqa: PLC0415
-
-    name, _, profile = sweep.partition(":")
-    return summarise(Tracker(uri or tracking).reader.read_sweep(name, profile or None))
 
 
 if __name__ == "__main__":

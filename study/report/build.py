@@ -1,21 +1,30 @@
-"""Build a sweep's report: figures, JSON, Markdown and PDF."""
+"""Write what the command line asks for: a sweep's report with its files, or a comparison."""
 
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:  # the command answers --help without the libraries that only a report needs
-    from study.report.document import Block
-    from study.results.sweep_record import SweepRecord
-    from study.tracking.tracker import Tracker
+import typst
 
+from study.config.workspace import REPORTS
+from study.errors import BadInputError, masked
+from study.figures.style import METADATA, save, write
+from study.report.comparison import compare
+from study.report.document import Block
+from study.report.drawings import draw, draw_sweeps
+from study.report.markdown import markdown
+from study.report.model import Report, read_report
+from study.report.summary import summarise
+from study.report.text import document
+from study.results.sweep_record import SweepRecord
+from study.tracking.tracker import Tracker
+from study.tracking.variants import read_variants
 
 TEMPLATE = Path(__file__).with_name("report.typ")
-REPORTS = Path("reports")
 
 
 def build_report(record: SweepRecord, folder: Path = REPORTS) -> Path:
@@ -23,25 +32,18 @@ def build_report(record: SweepRecord, folder: Path = REPORTS) -> Path:
 
     The same record gives the same bytes. Works for a sweep with unfinished cells, and says so on its first page.
     """
-    from study.figures.style import save  # noqa: PLC0415
-    from study.report.drawings import draw  # noqa: PLC0415
-    from study.report.model import FigureText  # noqa: PLC0415
-    from study.report.summary import summarise  # noqa: PLC0415
-    from study.report.text import document  # noqa: PLC0415
-
-    report, own = summarise(record), folder / record.grid.name
-    drawings = draw(record, report)
-    figures = tuple(FigureText.model_validate(drawing, from_attributes=True) for drawing in drawings)
-    report = report.model_copy(update={"figures": figures})
-    files = [file for drawing in drawings for file in save(drawing.figure, own / "figures", drawing.name)]
-    for left in (own / "figures").glob("*"):
-        if left not in files:  # of an earlier report with other cells
-            left.unlink()
-    _write(own / "report.json", report.json())
-    draft = own / ".curves.parquet"
+    report, files = summarise(record), folder / record.grid.name
+    figures = draw(record, report)
+    report = report.model_copy(update={"figures": tuple(figures)})
+    written = [file for name, figure in figures.items() for file in save(figure, files / "figures", name)]
+    for file in (files / "figures").glob("*"):
+        if file not in written:  # of an earlier report with other cells
+            file.unlink()
+    _write(files / "report.json", report.json())
+    draft = files / ".curves.parquet"
     record.table(ceiling=True).to_parquet(draft, index=False)
-    draft.replace(own / "curves.parquet")
-    pictures = {f"figures/{file.name}": file.read_bytes() for file in files if file.suffix == ".svg"}
+    draft.replace(files / "curves.parquet")
+    pictures = {f"figures/{file.name}": file.read_bytes() for file in written if file.suffix == ".svg"}
     pdf = folder / f"{record.grid.name}.pdf"
     sweep = report.sweep
     title, footer = f"{sweep.title} ({sweep.name}, {sweep.profile})", f"{sweep.name} ({sweep.profile})"
@@ -51,8 +53,6 @@ def build_report(record: SweepRecord, folder: Path = REPORTS) -> Path:
 
 def typeset(title: str, footer: str, blocks: Sequence[Block], pictures: dict[str, bytes]) -> bytes:
     """Return the PDF of a document and its pictures, with the fonts that Typst brings along."""
-    import typst  # noqa: PLC0415
-
     listed = [{"kind": type(block).__name__, **asdict(block)} for block in blocks]
     content = json.dumps({"title": title, "footer": footer, "blocks": listed}).encode()
     files = {"main.typ": TEMPLATE.read_bytes(), "document.json": content, **pictures}
@@ -71,15 +71,54 @@ def _write(path: Path, content: bytes) -> None:
 def publish(tracker: Tracker, name: str, profile: str | None, folder: Path) -> Path:
     """Build the report from the tracker alone, and add it to the sweep's run. Returns the PDF's path."""
     pdf = build_report(complete_cells(tracker, name, profile), folder)
-    own, sweep_run = folder / name, tracker.reader.sweep_run(name, profile)
-    tracker.log_files(sweep_run, [pdf, own / "report.json", own / "curves.parquet"], "report")
-    tracker.log_files(sweep_run, sorted((own / "figures").iterdir()), "figures")
+    files, sweep_run = folder / name, tracker.reader.sweep_run(name, profile)
+    tracker.log_files(sweep_run, [pdf, files / "report.json", files / "curves.parquet"], "report")
+    tracker.log_files(sweep_run, sorted((files / "figures").iterdir()), "figures")
     return pdf
 
 
 def complete_cells(tracker: Tracker, name: str, profile: str | None) -> SweepRecord:
     """Return a sweep with those that vary one of its confounds."""
-    from study.tracking.variants import read_variants  # noqa: PLC0415
-
     record = tracker.reader.read_sweep(name, profile)
     return replace(record, variants=read_variants(tracker.reader, record))
+
+
+def report_as_markdown(tracker: Tracker, name: str, profile: str | None) -> str:
+    """Return the report of a sweep as Markdown, without figures."""
+    return markdown(document(summarise(complete_cells(tracker, name, profile))))
+
+
+def side_by_side(first: str, second: str, tracking: str, figure: Path | None = None) -> str:
+    """Return two sweeps' comparison as Markdown, each named by a path or as NAME[:PROFILE][@URI].
+
+    Both are drawn into `figure` first, where there is one. Raises BadInputError for what cannot be read or written.
+    """
+    if figure:
+        _check_figure(figure)
+    sides, names = (_report(first, tracking), _report(second, tracking)), (masked(first), masked(second))
+    if figure:
+        try:
+            write(draw_sweeps(*sides, names), figure)
+        except OSError as error:
+            raise BadInputError(f"cannot write {figure}: {error.strerror}; name another file") from error
+    return markdown(compare(*sides, names, Path(os.path.relpath(figure)).as_posix() if figure else ""))
+
+
+def _check_figure(file: Path) -> None:
+    """Refuse what cannot become a figure, before anything is read."""
+    if file.suffix[1:].lower() not in METADATA:
+        raise BadInputError(
+            f"--figure {file}: write {', '.join(f'.{kind}' for kind in METADATA)}, chosen by its ending"
+        )
+    if not file.parent.is_dir():
+        raise BadInputError(f"--figure {file}: there is no folder {file.parent}; make it first: mkdir -p {file.parent}")
+    if file.is_dir():
+        raise BadInputError(f"--figure {file} is a folder; name a file in it")
+
+
+def _report(source: str, tracking: str) -> Report:
+    sweep, _, uri = source.partition("@")
+    if Path(source).exists() or "/" in sweep or sweep.endswith(".json"):
+        return read_report(Path(source))
+    name, _, profile = sweep.partition(":")
+    return summarise(Tracker(uri or tracking).reader.read_sweep(name, profile or None))

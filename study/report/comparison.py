@@ -1,120 +1,132 @@
 """Two sweeps side by side: what they differ in, their scores with differences, orders of head sets, verdicts.
 
-Whatever made them: two commits, two simulators, two profiles, two stores.
+Either may come from another commit, simulator, profile or store.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Iterator
+from functools import partial
 
 from study.analysis import comparisons
 from study.analysis.claims import Verdict
-from study.analysis.effects import MINUS
+from study.analysis.effects import MINUS, ordered
 from study.analysis.intervals import Estimate
-from study.analysis.learning_curves import Point
+from study.analysis.learning_curves import ACCURACY, Point
+from study.analysis.metrics import Metric
 from study.config.grid import Cell
-from study.config.heads import HEAD_SETS
-from study.report.document import (
-    Block,
-    Heading,
-    Inline,
-    Paragraph,
-    Picture,
-    Row,
-    bold,
-    code,
-    italic,
-    lines,
-    plain,
-    table,
-)
+from study.report.document import Block, Inline, bold, code, italic, lines, plain, table
 from study.report.model import Report, Score, Spread
-from study.report.rounding import LOSS, NOTHING, UNITS, between, epochs, fixed, interval, kinds, percent
+from study.report.rounding import NOTHING, UNITS, between, epochs, fixed, interval, percent, show
+from study.report.text import counts, render, title
 
-SHARE_WORDS = (
-    "Ceiling: policies that are given the true state in the place of a latent. Share of gain: a score's part of the "
-    "way from the commonest class to there (acceleration only, since the state holds no route)."
-)
-
-
-class Measure(NamedTuple):
-    """A score: its name in a report, how tables print it, and the guess that makes its floor."""
-
-    name: str
-    title: str
-    digits: int
-    factor: float
-    guess: str
-
-    def show(self, value: float, *, sign: bool = False) -> str:
-        """Return a value as tables print it."""
-        return fixed(value, self.digits, self.factor, sign=sign)
+Rows = list[list[object]]
+Sides = tuple[Report, Report]
 
 
-MEASURES = (
-    Measure("accuracy", "accuracy [%]", 2, 100.0, "commonest class"),
-    Measure("steering", f"steering [{LOSS}]", 3, 1e3, "best constant command"),
-)
+def compare(first: Report, second: Report, names: tuple[str, str], picture: str = "") -> list[Block]:
+    """Return the document of two reports; `names` say where each comes from, `picture` is the file of their figure."""
+    sides, cells = (first, second), labels(first, second)
+    both = [point for point in cells if all(point in side.by_point for side in sides)]
+    differing, same = _differing(sides)
+    bars: list[Spread | Estimate] = [row.accuracy for side in sides for row in side.scores]
+    bars += [gain for side in sides for point in cells if (gain := side.above_baseline(point))]
+    return render(
+        "comparison.md.jinja",
+        {"two_sweeps": picture} if picture else {},
+        first=first,
+        second=second,
+        names=names,
+        minus=MINUS,
+        keys=(side_key("first", first, names[0]), side_key("second", second, names[1])),
+        bars=bars,
+        accuracies=[(cells[point], *(_mean(side, point) for side in sides)) for point in cells],
+        differing=table(("", "first", "second"), differing, left=3),
+        same=same,
+        both=both,
+        changes=[change for metric in _shared_metrics(sides) for change in _changes(sides, metric.name, both)],
+        allowance=max(side.rules.get("encoder_allowance", 0.0) for side in sides),
+        shared=[f"{cells[point]} ({words})" for point in both if (words := _shared(sides, point))],
+        scores=[_scores(sides, metric, cells, both) for metric in _shared_metrics(sides)],
+        alone=[
+            [cells[point] for point in cells if point in one.by_point and point not in other.by_point]
+            for one, other in (sides, sides[::-1])
+        ],
+        orders=table(("fraction", "first", "second", "order"), _orders(sides), left=4),
+        convergence=_convergence(sides, cells),
+        changed=_changed(sides),
+        verdicts=table(("Claim", "first", "second"), _verdicts(sides), left=3),
+    )
 
 
-def compare(first: Report, second: Report, names: tuple[str, str], picture: Picture | None = None) -> list[Block]:
-    """Return the document of two reports; `names` say where each comes from, `picture` is shown with the scores."""
-    sources = f"First: {code(names[0])}. Second: {code(names[1])}. Differences are second {MINUS} first."
-    return [
-        Heading(1, f"{plain(first.sweep.title)}: two sweeps side by side"),
-        Paragraph(sources),
-        Heading(2, "What differs"),
-        *_differing(first, second),
-        Heading(2, "Final scores"),
-        *([picture] if picture else []),
-        *_scores(first, second),
-        Heading(2, "Order of head sets by accuracy"),
-        *_orders(first, second),
-        *_convergence(first, second),
-        Heading(2, "Verdicts"),
-        *_verdicts(first, second),
-    ]
+def labels(first: Report, second: Report) -> dict[Point, str]:
+    """Return the head sets and fractions that either has scores of, most data first, with names to tell them apart."""
+    points = {*first.by_point, *second.by_point}
+    heads = ordered(sorted(name for name, _ in points))
+    cells = sorted(points, key=lambda point: (-point[1], heads.index(point[0])))
+    several = len({fraction for _, fraction in cells}) > 1
+    return {(name, part): f"{name} at {100 * part:g} %" if several else name for name, part in cells}
 
 
-def _differing(first: Report, second: Report) -> Iterator[Block]:
-    """Yield what differs in sweep, data, provenance, rules and settings; what does not is named in a line."""
-    sides = [dict(_facts(report)) for report in (first, second)]
-    names = list(dict.fromkeys([*sides[0], *sides[1]]))
-    other = [name for name in names if sides[0].get(name) != sides[1].get(name)]
-    rows = [(name, *(code(side[name]) if name in side else NOTHING for side in sides)) for name in other]
-    yield from table(("", "first", "second"), rows, left=3)
-    groups = {name: name.partition(" ")[0] for name in names}
-    same = [group for group in dict.fromkeys(groups.values()) if all(groups[name] != group for name in other)]
-    if same:
-        yield Paragraph(f"Nothing differs in: {', '.join(same)}.")
+def side_key(word: str, report: Report, name: str, most: int = 60) -> str:
+    """Return which sweep it is, with n; of a long name the end."""
+    shown = name if len(name) <= most else f"\N{HORIZONTAL ELLIPSIS}{name[1 - most :]}"
+    units = "policies on one encoder" if report.sweep.design == "A" else "encoders"
+    return f"{word}, {shown} (n = {counts(row.accuracy.n for row in report.scores) or 0} {units})"
+
+
+def ends_text(first: Report, second: Report) -> str:
+    """Return floor and ceiling of accuracy in words, of both sweeps where they differ."""
+    floors = [side.floor[ACCURACY] for side in (first, second)]
+    tops = [side.ceiling.mean for side in (first, second) if side.ceiling]
+    parts = ["(a): axis cut"]
+    for word, values in (("majority class", floors), ("true state", tops)):
+        shown = dict.fromkeys(f"{100 * value:.1f}" for value in values if not math.isnan(value))
+        parts += [f"{word} at {' and '.join(shown)} %"] if shown else []
+    return "; ".join(parts)
+
+
+def _mean(side: Report, point: Point) -> str:
+    return f"{percent(side.by_point[point].accuracy.mean)} %" if point in side.by_point else "none"
+
+
+# --- what differs ---------------------------------------------------------------------------------------------------
+
+
+def _differing(sides: Sides) -> tuple[Rows, list[str]]:
+    """Return what differs in sweep, data, provenance, rules and settings, and the groups in which nothing does."""
+    facts = [dict(_facts(report)) for report in sides]
+    names = list(dict.fromkeys([*facts[0], *facts[1]]))
+    other = [name for name in names if facts[0].get(name) != facts[1].get(name)]
+    rows: Rows = [[name, *(code(side[name]) if name in side else NOTHING for side in facts)] for name in other]
+    differing = {name.partition(" ")[0] for name in other}
+    return rows, [group for group in dict.fromkeys(name.partition(" ")[0] for name in names) if group not in differing]
 
 
 def _facts(report: Report) -> Iterator[tuple[str, str]]:
     """Yield name and value of everything that two sweeps may differ in; a name's first word is its group."""
-    own, sweep = report.provenance, report.sweep
-    shown = ("name", "simulator", "profile", "design", "encoder_seeds", "policy_seeds", "policy_epochs", "baseline")
-    for name in shown:
+    sweep, origin = report.sweep, report.provenance
+    for name in (
+        *("name", "simulator", "profile", "design", "encoder_seeds", "policy_seeds", "policy_epochs", "baseline"),
+    ):
         yield f"sweep {name}", str(getattr(sweep, name))
     yield "sweep cells", ", ".join(row.cell for row in report.scores)
     yield "sweep finished", f"{sweep.finished} of {sweep.planned}"
-    yield "commit", f"{own.commit or 'unknown'}{' with uncommitted changes' * bool(own.dirty)}"
+    yield "commit", f"{origin.commit or 'unknown'}{' with uncommitted changes' * bool(origin.dirty)}"
     yield "data key", str(report.data.key)
     for name, content in report.data.sets.items():
         for count in ("frames", "drives", "test_drives"):
             yield f"data {name} {count}", str(content.get(count))
-    for name, value in report.floor.items():
-        yield f"floor {name}", fixed(value, 6)
-    yield "versions lock", str(own.lock)
-    yield "versions python", str(own.python)
-    for name, version in own.packages.items():
-        yield f"versions {name}", version
-    yield "machine platform", str(own.platform)
-    yield "machine cpu", str(own.cpu)
-    for name, value in report.rules.items():
-        yield f"rules {name}", f"{value:g}"
+    for name, floor in report.floor.items():
+        yield f"floor {name}", fixed(floor, 6)
+    for name, version in {"lock": origin.lock, "python": origin.python, **origin.packages}.items():
+        yield f"versions {name}", str(version)
+    yield "machine platform", str(origin.platform)
+    yield "machine cpu", str(origin.cpu)
+    for name, rule in report.rules.items():
+        yield f"rules {name}", f"{rule:g}"
     for setting in report.settings:
         yield f"settings {setting.group}.{setting.name}", setting.value
 
@@ -122,59 +134,45 @@ def _facts(report: Report) -> Iterator[tuple[str, str]]:
 # --- scores ---------------------------------------------------------------------------------------------------------
 
 
-def labels(first: Report, second: Report) -> dict[Point, str]:
-    """Return the head sets and fractions that either has scores of, most data first, with names to tell them apart."""
-    order = {heads: place for place, heads in enumerate(HEAD_SETS)}
-    cells = sorted(
-        {*first.points, *second.points}, key=lambda point: (-point[1], order.get(point[0], len(order)), point[0])
-    )
-    several = len({fraction for _, fraction in cells}) > 1
-    return {(heads, part): f"{heads} at {100 * part:g} %" if several else heads for heads, part in cells}
+def _shared_metrics(sides: Sides) -> list[Metric]:
+    """Return the metrics that both have, as the second describes them."""
+    return [metric for metric in sides[1].metrics if metric.name in {other.name for other in sides[0].metrics}]
 
 
-def _scores(first: Report, second: Report) -> Iterator[Block]:
-    names, sides = labels(first, second), (first, second)
-    scores = [{(row.heads, row.fraction): row for row in report.scores} for report in sides]
-    both = {point: (scores[0][point], scores[1][point]) for point in names if all(point in side for side in scores)}
-    if not both:
-        yield Paragraph("No head set and fraction is finished in both.")
-    pairs: dict[str, list[tuple[str, Spread | None, Spread | None]]] = {
-        "accuracy": [(names[point], one.accuracy, other.accuracy) for point, (one, other) in both.items()],
-        "steering": [(names[point], one.steering, other.steering) for point, (one, other) in both.items()],
-    }
-    if first.ceiling or second.ceiling:
-        pairs["accuracy"].append((italic("ceiling (true state)"), first.ceiling, second.ceiling))
-    changes = [difference(one, other) for own in pairs.values() for _, one, other in own if one and other]
-    shares = first.ceiling and second.ceiling
-    if changes:
-        yield Paragraph(" ".join([_about(first, second, changes), *([SHARE_WORDS] if shares else [])]))
-    same = [f"{plain(names[point])} ({words})" for point, own in both.items() if (words := _shared(sides, *own))]
-    if same:
-        yield Paragraph(f"Cells of the same key in both: {', '.join(same)}.")
-    for measure in MEASURES:
-        header = [measure.title, "first (n)", "second (n)", "difference", "95 %"]
-        rows = [[name, *_beside(measure, one, other)] for name, one, other in pairs[measure.name]]
-        floors = [measure.show(report.floor.get(measure.name, math.nan)) for report in sides]
-        rows.append([italic(f"floor ({measure.guess})"), *floors, NOTHING, NOTHING])
-        if shares and measure.name == "accuracy":
-            header += ["share of gain, first [%]", "share of gain, second [%]"]
-            gains = [*((one.share, other.share) for one, other in both.values()), (1.0, 1.0), (0.0, 0.0)]
-            rows = [[*row, *(percent(share, 0) for share in gain)] for row, gain in zip(rows, gains, strict=True)]
-        yield from table(header, rows)
-    for name, one, other in (("first", first, second), ("second", second, first)):
-        alone = [plain(names[point]) for point in names if point in one.points and point not in other.points]
-        if alone:
-            yield Paragraph(f"Only in the {name}: {', '.join(alone)}.")
+def _spreads(sides: Sides, name: str, point: Point) -> list[Spread | None]:
+    return [side.by_point[point].metrics.get(name) for side in sides]
 
 
-def _beside(measure: Measure, first: Spread | None, second: Spread | None) -> list[str]:
+def _changes(sides: Sides, name: str, both: list[Point]) -> list[Estimate]:
+    pairs = [_spreads(sides, name, point) for point in both]
+    pairs += [[side.ceiling for side in sides]] if name == ACCURACY else []
+    return [difference(one, other) for one, other in pairs if one and other]
+
+
+def _scores(sides: Sides, metric: Metric, cells: dict[Point, str], both: list[Point]) -> Inline:
+    """Return a metric's table; that of accuracy has shares of the possible gain where both have a ceiling."""
+    ceilings = [side.ceiling for side in sides] if metric.name == ACCURACY else [None, None]
+    header: list[str] = [title(metric), "first (n)", "second (n)", "difference", "95 %"]
+    rows: Rows = [[cells[point], *_beside(metric, *_spreads(sides, metric.name, point))] for point in both]
+    if any(ceilings):
+        rows.append([italic("ceiling (true state)"), *_beside(metric, *ceilings)])
+    if metric.guess:
+        floors = [show(metric, side.floor.get(metric.name)) for side in sides]
+        rows.append([italic(f"floor ({metric.guess})"), *floors, NOTHING, NOTHING])
+    if all(ceilings):
+        header += ["share of gain, first [%]", "share of gain, second [%]"]
+        shares = [*([side.by_point[point].share for side in sides] for point in both), [1.0, 1.0], [0.0, 0.0]]
+        rows = [[*row, *(percent(share, 0) for share in pair)] for row, pair in zip(rows, shares, strict=True)]
+    return table(header, rows)
+
+
+def _beside(metric: Metric, first: Spread | None, second: Spread | None) -> list[str]:
     """Return two scores with n, and their difference with its interval."""
-    cells = [f"{measure.show(side.mean)} ({side.n})" if side else NOTHING for side in (first, second)]
+    cells = [f"{show(metric, side.mean)} ({side.n})" if side else NOTHING for side in (first, second)]
     if not first or not second:
         return [*cells, NOTHING, NOTHING]
-    change = difference(first, second)
-    low, high = (measure.show(end, sign=True) for end in (change.low, change.high))
-    return [*cells, measure.show(change.value, sign=True), low if low == NOTHING else f"{low} to {high}"]
+    change, signed = difference(first, second), partial(show, metric, sign=True)
+    return [*cells, signed(change.value), interval(change, signed)]
 
 
 def difference(first: Spread, second: Spread) -> Estimate:
@@ -189,98 +187,73 @@ def difference(first: Spread, second: Spread) -> Estimate:
     return comparisons.welch(list(second.units.values()), list(first.units.values()))
 
 
-def _about(first: Report, second: Report, changes: Sequence[Estimate]) -> str:
-    """Return what the intervals are over."""
-    text = (
-        "Mean of the last five epochs on test drives; n are policies on one encoder, or encoders where there are "
-        f"several. Interval: {kinds(changes)}."
-    )
-    if "A" in (first.sweep.design, second.sweep.design):
-        allowance = max(report.rules.get("encoder_allowance", 0.0) for report in (first, second))
-        text += (
-            " With one encoder a cell it says nothing about other encoders, which by the sweep files' rules may differ "
-            f"by {percent(allowance)} points through their seeds alone."
-        )
-    return text
-
-
-def _shared(sides: tuple[Report, Report], first: Score, second: Score) -> str:
+def _shared(sides: Sides, point: Point) -> str:
     """Return whether a cell has the same keys in both, and whether it is one result or two runs."""
-    mine, theirs = (_keys(report, first) for report in sides)
-    if not mine or mine != theirs:
+    first, second = (side.by_point[point] for side in sides)
+    keys = [_keys(side, point) for side in sides]
+    if not keys[0] or keys[0] != keys[1]:
         return ""
-    equal = first.accuracy == second.accuracy and first.steering == second.steering
-    return "the same result" if equal else "same settings, run twice"
+    return "the same result" if first.metrics == second.metrics else "same settings, run twice"
 
 
-def _keys(report: Report, score: Score) -> list[str]:
+def _keys(report: Report, point: Point) -> list[str]:
     seeds = range(report.sweep.encoder_seeds)
-    cells = [Cell(heads=score.heads, fraction=score.fraction, encoder_seed=seed).label for seed in seeds]
+    cells = [Cell(heads=point[0], fraction=point[1], encoder_seed=seed).label for seed in seeds]
     return [report.provenance.keys[label] for label in cells if label in report.provenance.keys]
 
 
 # --- orders, convergence, verdicts ----------------------------------------------------------------------------------
 
 
-def _orders(first: Report, second: Report) -> Iterator[Block]:
-    fractions = sorted({fraction for report in (first, second) for _, fraction in report.points}, reverse=True)
-    rows: list[Row] = []
-    for fraction in fractions:
+def _orders(sides: Sides) -> Rows:
+    rows: Rows = []
+    for fraction in sorted({fraction for side in sides for _, fraction in side.by_point}, reverse=True):
         chains, orders = [], []
-        for report in (first, second):
-            at = sorted((row for row in report.scores if row.fraction == fraction), key=lambda row: -row.accuracy.mean)
-            signs = [_sign(report, (up.heads, fraction), (down.heads, fraction)) for up, down in itertools.pairwise(at)]
-            orders.append([row.heads for row in at])
+        for report in sides:
+            scores = [row for row in report.scores if row.fraction == fraction]
+            scores.sort(key=lambda row: -row.accuracy.mean)
+            signs = [_sign(report, higher, lower) for higher, lower in itertools.pairwise(scores)]
+            orders.append([row.heads for row in scores])
             chain = itertools.zip_longest(map(plain, orders[-1]), signs, fillvalue="")
             chains.append(Inline(" ".join(f"{name} {sign}" for name, sign in chain).strip()) or NOTHING)
         one, other = ([name for name in order if all(name in side for side in orders)] for order in orders)
         verdict = NOTHING if len(one) < 2 else "the same" if one == other else bold("another")
-        rows.append((f"{100 * fraction:g} %", *chains, verdict))
-    if rows:
-        yield Paragraph(
-            "`>`: above the next by the simultaneous interval of their paired difference; `~`: not so. Order: of the "
-            "head sets that both have."
-        )
-    yield from table(("fraction", "first", "second", "order"), rows, left=4)
+        rows.append([f"{100 * fraction:g} %", *chains, verdict])
+    return rows
 
 
-def _sign(report: Report, up: Point, down: Point) -> str:
+def _sign(report: Report, higher: Score, lower: Score) -> str:
     for contrast in report.accuracy_contrasts:
-        if {contrast.first, contrast.second} == {up, down}:
+        if {contrast.first, contrast.second} == {higher.point, lower.point}:
             low, high = contrast.simultaneous
-            return ">" if (low > 0 if contrast.first == up else high < 0) else "~"
+            return ">" if (low > 0 if contrast.first == higher.point else high < 0) else "~"
     return "~"
 
 
-def _convergence(first: Report, second: Report) -> Iterator[Block]:
-    names = labels(first, second)
-    others = {(row.heads, row.fraction): row for row in second.convergence}
-    rows: list[Row] = []
-    for one in first.convergence:
-        point = (one.heads, one.fraction)
-        if point in others:
-            both = (one, others[point])
-            curves = (f"{epochs(row.mean_curve.value)} ({interval(row.mean_curve, epochs)})" for row in both)
-            shares, areas = (percent(row.share, 0) for row in both), (percent(row.area, 2) for row in both)
-            rows.append((names[point], *curves, *shares, *areas))
-    if rows:
-        yield Heading(2, "Convergence")
-        yield Paragraph(
-            "Epochs until the mean curve reaches the baseline's final accuracy of its own sweep (95 %), share of the "
-            "seeds that do [%], mean accuracy over all epochs [%]."
-        )
-    header = (f"{name}, {side}" for name in ("epochs", "share", "area") for side in ("first", "second"))
-    yield from table(("Cell", *header), rows)
+def _convergence(sides: Sides, cells: dict[Point, str]) -> Inline:
+    first, second = ({(row.heads, row.fraction): row for row in side.convergence} for side in sides)
+    rows: Rows = []
+    for point in (point for point in first if point in second):
+        both = (first[point], second[point])
+        curves = (f"{epochs(row.mean_curve.value)} ({interval(row.mean_curve, epochs)})" for row in both)
+        shares, areas = (percent(row.share, 0) for row in both), (percent(row.area, 2) for row in both)
+        rows.append([cells[point], *curves, *shares, *areas])
+    header = [f"{name}, {side}" for name in ("epochs", "share", "area") for side in ("first", "second")]
+    return table(["Cell", *header], rows) if rows else Inline()
 
 
-def _verdicts(first: Report, second: Report) -> Iterator[Block]:
-    sides = [{claim.claim: claim for claim in report.claims} for report in (first, second)]
-    both = {name: [side.get(name) for side in sides] for name in dict.fromkeys([*sides[0], *sides[1]])}
-    changed = [name for name, (one, other) in both.items() if one and other and one.outcome != other.outcome]
-    if both:
-        yield Paragraph(f"Verdicts that changed: {', '.join(map(plain, changed)) or 'none'}.")
-    rows = [(bold(name) if name in changed else name, *map(_verdict, own)) for name, own in both.items()]
-    yield from table(("Claim", "first", "second"), rows, left=3)
+def _claims(sides: Sides) -> dict[str, list[Verdict | None]]:
+    verdicts = [{row.claim: row for row in side.claims} for side in sides]
+    return {name: [side.get(name) for side in verdicts] for name in dict.fromkeys([*verdicts[0], *verdicts[1]])}
+
+
+def _changed(sides: Sides) -> list[str]:
+    return [name for name, (one, other) in _claims(sides).items() if one and other and one.outcome != other.outcome]
+
+
+def _verdicts(sides: Sides) -> Rows:
+    changed = _changed(sides)
+    return [[bold(name) if name in changed else name, *map(_verdict, pair)] for name, pair in _claims(sides).items()]
 
 
 def _verdict(claim: Verdict | None) -> str:
@@ -288,7 +261,7 @@ def _verdict(claim: Verdict | None) -> str:
         return NOTHING
     findings = []
     for finding in claim.findings:
-        unit, own = UNITS[finding.unit], finding.estimate
-        value, ends = unit.phrase.format(unit.show(own.value)), between(own.low, own.high, unit.show)
-        findings.append(f"{finding.what}: {value} ({ends}, n = {own.n}), {finding.state}")
+        unit, estimate = UNITS[finding.unit], finding.estimate
+        value, ends = unit.phrase.format(unit.show(estimate.value)), between(estimate.low, estimate.high, unit.show)
+        findings.append(f"{finding.what}: {value} ({ends}, n = {estimate.n}), {finding.state}")
     return lines([bold(claim.outcome), *(findings or [claim.reason])])

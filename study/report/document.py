@@ -1,13 +1,13 @@
 """A document as data: headings, paragraphs, tables and figures, whose texts are inline Markdown.
 
 Inline Markdown here is `code`, **bold**, *italic*, a backslash before a character that stands for itself, and, in a
-table's cell, a new line.
+table's cell, `<br>` for a new line.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 
@@ -41,10 +41,7 @@ def italic(text: object) -> Inline:
 
 def lines(parts: Sequence[object]) -> Inline:
     """Return the lines of a table's cell."""
-    return Inline("\n".join(map(plain, parts)))
-
-
-Row = Sequence[object]
+    return Inline("<br>".join(map(plain, parts)))
 
 
 @dataclass(frozen=True)
@@ -86,29 +83,31 @@ class Picture:
 Block = Heading | Paragraph | Table | Picture
 
 
-def table(header: Sequence[str], rows: Sequence[Row], left: int = 1) -> list[Table]:
-    """Return a table whose first `left` columns are flush left, the others flush right; none without a row.
+def table(header: Sequence[str], rows: Iterable[Sequence[object]], left: int = 1) -> Inline:
+    """Return a table's lines for a text, its first `left` columns flush left, the others flush right.
 
     The header is inline Markdown; what is no `Inline` in a row is escaped.
     """
-    if not rows:
-        return []
-    align = "l" * left + "r" * (len(header) - left)
-    return [Table(tuple(header), align, tuple(tuple(map(plain, row)) for row in rows))]
+    marks = ["---"] * left + ["--:"] * (len(header) - left)
+    return Inline(
+        "\n".join(f"| {' | '.join(map(plain, row))} |" for row in (map(Inline, header), map(Inline, marks), *rows))
+    )
 
 
-def parse(text: str, pictures: Mapping[str, Sequence[Picture]]) -> Iterator[Block]:
+def parse(text: str, pictures: Mapping[str, str]) -> Iterator[Block]:
     """Yield the blocks of a text, which blank lines separate.
 
-    `#` starts a heading and `>` a notice. `Figures PLACE` stands for the pictures of a place. `Table: CAPTION` is
-    followed by a header, a line of alignments, rows, and notes; a table without any row is left out.
+    `#` starts a heading and `>` a notice. `Table: CAPTION` is followed by a header, a line of alignments, rows, and
+    notes; a table without any row is left out. `Figure: NAME` is followed by a caption and `Alt:` with the same in
+    words; a figure that is not in `pictures`, by name its file, is left out.
     """
     for block in filter(None, (part.strip() for part in re.split(r"\n\s*\n", text))):
         words = " ".join(block.split())
         if heading := re.fullmatch(r"(#+) (.*)", words):
             yield Heading(len(heading[1]), heading[2])
-        elif words.startswith("Figures "):
-            yield from pictures.get(words.removeprefix("Figures "), ())
+        elif figure := re.fullmatch(r"Figure: (\S+) (.*) Alt: (.*)", words):
+            if figure[1] in pictures:
+                yield Picture(pictures[figure[1]], figure[2], figure[3])
         elif found := re.fullmatch(r"Table:(.*?)((?:^\|[^\n]*\n?)+)(.*)", block, re.DOTALL | re.MULTILINE):
             header, marks, *rows = (_cells(line) for line in found[2].splitlines())
             caption, notes = (" ".join(part.split()) for part in (found[1], found[3]))

@@ -31,4 +31,4 @@ def _block(block: Block) -> str:
 
 
 def _row(cells: Iterable[str]) -> str:
-    return f"| {' | '.join(cell.replace(chr(10), '<br>') for cell in cells)} |"
+    return f"| {' | '.join(cells)} |"

@@ -13,15 +13,16 @@ from pathlib import Path
 from typing import Any, Literal
 
 from study.analysis import confounds, learning_curves
-from study.analysis.claims import Verdict
+from study.analysis.claims import OUTCOMES, Verdict
 from study.analysis.effects import Contrast, Interval
 from study.analysis.intervals import Estimate
 from study.analysis.learning_curves import Point
+from study.analysis.metrics import Metric
 from study.config.files import validated
 from study.config.settings import Number, Settings
 from study.errors import BadInputError
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2  # 2: scores by name of the metric, with the metrics' records
 
 
 class Part(Settings, extra="ignore"):
@@ -70,21 +71,31 @@ class Spread(Part):
 
 
 class Score(Part):
-    """Final scores of a cell; `share` is the gain's part of the possible gain, where there is a ceiling."""
+    """Final scores of a cell by name of the metric; `share` is the gain's part of the possible gain below a ceiling.
+
+    `confusion`: the share of each true class (row) that is given each class, after the last epoch.
+    """
 
     cell: str
     heads: str
     fraction: float
     encoders: int
     n: int
-    accuracy: Spread
-    steering: Spread
-    balanced: Spread | None = None
+    metrics: dict[str, Spread]
     gain: Number
     share: Number = math.nan
-    macro_f1: Number
     confusion: tuple[tuple[Number, ...], ...]
     classes: tuple[float, ...]
+
+    @property
+    def point(self) -> Point:
+        """Return head set and fraction."""
+        return (self.heads, self.fraction)
+
+    @property
+    def accuracy(self) -> Spread:
+        """Return the accuracy of acceleration, which most figures and claims are about."""
+        return self.metrics[learning_curves.ACCURACY]
 
 
 class Convergence(Part):
@@ -165,13 +176,13 @@ class Data(Part):
 
 
 class CellCost(Part):
-    """Wall time [s] and memory [bytes] of a cell, and where it ran."""
+    """Wall time [s] and memory [bytes] of a cell, and where it ran; `total` is the cell's time from start to end."""
 
     cell: str
     encoder: Number
     encode: Number
     policies: Number
-    whole: Number
+    total: Number
     peak_bytes: int | None
     device: str | None
     precision: str | None
@@ -205,20 +216,12 @@ class Provenance(Part):
     keys: dict[str, str]
 
 
-class FigureText(Part):
-    """A figure's file name, its place in the report, its caption, and what it shows in words."""
-
-    name: str
-    place: str
-    caption: str
-    alt: str
-
-
 class Report(Part):
     """Every number of a sweep's report: NaN where there is none, infinite for an epoch that is never reached."""
 
     format_version: int = FORMAT_VERSION
     sweep: Sweep
+    metrics: tuple[Metric, ...]
     floor: dict[str, Number]
     ceiling: Spread | None = None
     scores: tuple[Score, ...]
@@ -236,13 +239,18 @@ class Report(Part):
     data: Data
     cost: Cost
     provenance: Provenance
-    outcomes: dict[str, tuple[str, ...]]
-    figures: tuple[FigureText, ...] = ()
+    figures: tuple[str, ...] = ()
 
     @property
-    def points(self) -> list[Point]:
-        """Return the head sets and fractions that have a score."""
-        return [(row.heads, row.fraction) for row in self.scores]
+    def by_point(self) -> dict[Point, Score]:
+        """Return the scores by head set and fraction."""
+        return {row.point: row for row in self.scores}
+
+    @property
+    def outcomes(self) -> dict[str, list[str]]:
+        """Return the names of the claims of each outcome that there is."""
+        outcomes = {outcome: [row.claim for row in self.claims if row.outcome == outcome] for outcome in OUTCOMES}
+        return {outcome: names for outcome, names in outcomes.items() if names}
 
     @property
     def accuracy_contrasts(self) -> list[Contrast]:
@@ -254,9 +262,9 @@ class Report(Part):
         base = (self.sweep.baseline, point[1])
         for row in self.accuracy_contrasts:
             if point != base and {row.first, row.second} == {point, base}:
-                own: Estimate = row.difference
-                turned = dataclasses.replace(own, value=-own.value, low=-own.high, high=-own.low)
-                return own if row.first == point else turned
+                gain: Estimate = row.difference
+                opposite = dataclasses.replace(gain, value=-gain.value, low=-gain.high, high=-gain.low)
+                return gain if row.first == point else opposite
         return None
 
     def json(self) -> bytes:  # type: ignore[override] # pydantic's own is deprecated

@@ -9,10 +9,12 @@ from functools import partial
 
 from study.analysis.effects import MINUS
 from study.analysis.intervals import Estimate
+from study.analysis.learning_curves import STEERING
+from study.analysis.metrics import METRICS, Metric
 from study.report.model import Spread
 
 NOTHING = "\N{EM DASH}"
-LOSS = "10\N{SUPERSCRIPT MINUS}\N{SUPERSCRIPT THREE}"
+LOSS = METRICS[STEERING].unit
 Show = Callable[[float], str]
 
 
@@ -32,8 +34,12 @@ def percent(value: float, digits: int = 1) -> str:
     return fixed(value, digits, 100)
 
 
+def show(metric: Metric, value: float | None, *, sign: bool = False) -> str:
+    """Return a metric's value in the metric's unit."""
+    return fixed(value, metric.digits, metric.factor, sign=sign)
+
+
 points = partial(fixed, digits=2, factor=100, sign=True)
-loss = partial(fixed, digits=3, factor=1e3)
 epochs = partial(fixed, digits=0)
 
 
@@ -63,7 +69,7 @@ def gigabytes(count: int | None) -> str:
     return NOTHING if count is None else f"{count / 1e9:.2f} GB"
 
 
-def whole(count: int | None) -> str:
+def thousands(count: int | None) -> str:
     """Return a count with thin spaces between thousands."""
     return NOTHING if count is None else f"{count:,}".replace(",", "\N{THIN SPACE}")
 
@@ -84,7 +90,7 @@ class Unit:
 
 UNITS = {
     "points": Unit("percentage points", points, "{} points"),
-    "loss": Unit(LOSS, partial(loss, sign=True), f"{{}} · {LOSS}"),
+    "loss": Unit(LOSS, partial(fixed, digits=3, factor=1e3, sign=True), f"{{}} · {LOSS}"),
     "epochs": Unit("epoch", epochs, "epoch {}"),
     "ratio": Unit("ratio", fixed, "ratio {}"),
 }

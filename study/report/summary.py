@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from collections.abc import Iterator, Mapping
@@ -10,9 +11,10 @@ from typing import Literal
 import numpy as np
 import pandas as pd
 
-from study.analysis import claims, confounds, convergence, effects, intervals, learning_curves, predictions
-from study.analysis.learning_curves import Panel, Point
-from study.config.heads import CEILING, HEAD_SETS
+from study.analysis import claims, confounds, convergence, effects, intervals, learning_curves, metrics, predictions
+from study.analysis.learning_curves import ACCURACY, STEERING, Point
+from study.analysis.metrics import METRICS
+from study.config.heads import HEADS
 from study.config.paper import ACCELERATIONS, parameter_counts
 from study.report.model import (
     CellCost,
@@ -33,40 +35,29 @@ from study.report.model import (
 )
 from study.results.cell_result import CellResult
 from study.results.sweep_record import SweepRecord
-from study.stages import cell_cost, data_cost, total
+from study.stages import RESULT_BYTES, data_cost
 
 SHOWN_PACKAGES = ("torch", "lightning", "highway-env", "gymnasium", "numpy", "scipy", "mlflow", "optuna", "typst")
 SIMULATOR = "a town of our own on highway-env, in the place of CARLA's Town03"
-METRICS = {"accuracy": learning_curves.ACCURACY, "steering": learning_curves.STEERING, "balanced": "balanced_accuracy"}
 NEAR = 30.0  # [m] a lead vehicle farther away may be outside the image
 
 
 def summarise(record: SweepRecord) -> Report:
     """Return the report of a sweep, over its finished cells."""
     grid, table = record.grid, record.table()
-    panels = {name: learning_curves.panel(table, metric) for name, metric in METRICS.items()}
-    accuracy = panels["accuracy"]
-    cells = {point: effects.label(point, grid) for point in _points(record)}
+    accuracy = learning_curves.panel(table, ACCURACY)
+    cells = {point: effects.label(point, grid) for point in effects.points(grid)}
     finished = {point: cell for point, cell in cells.items() if point in accuracy}
     base = accuracy.get((grid.baseline, max(grid.fractions)))
-    verdicts = [
-        verdict
-        for verdict in claims.judge(record)
-        if verdict.claim in grid.claims or (not grid.claims and (verdict.findings or verdict.missing))
-    ]
     floor, ceiling = _floor(record), _ceiling(record)
+    contrasts = (effects.compare(record, name, learning_curves.panel(table, name)) for name in (ACCURACY, STEERING))
     return Report(
         sweep=_sweep(record, "A" if learning_curves.design(accuracy.values()) == "A" else "B"),
+        metrics=tuple(METRICS.values()),
         floor=floor,
         ceiling=ceiling,
-        scores=tuple(
-            _score(record, point, cell, panels, floor["accuracy"], ceiling) for point, cell in finished.items()
-        ),
-        comparisons=tuple(
-            contrast
-            for name in ("accuracy", "steering")
-            for contrast in effects.compare(record, METRICS[name], panels[name])
-        ),
+        scores=tuple(_score(record, point, cell, floor[ACCURACY], ceiling) for point, cell in finished.items()),
+        comparisons=tuple(itertools.chain.from_iterable(contrasts)),
         planned_contrasts=len(effects.planned(grid)),
         convergence=tuple(
             _convergence(point, cell, accuracy[point], base) for point, cell in finished.items() if base is not None
@@ -77,24 +68,18 @@ def summarise(record: SweepRecord) -> Report:
         ),
         encoders=tuple(_encoders(table, cells)),
         probes=tuple(_probes(record, cells)),
-        claims=tuple(verdicts),
+        claims=tuple(
+            verdict
+            for verdict in claims.judge(record)
+            if verdict.claim in grid.claims or (not grid.claims and (verdict.findings or verdict.missing))
+        ),
         rules=grid.rules.model_dump(mode="json"),
         settings=tuple(_settings(record)),
         parameters=parameter_counts(),
         data=_data(record),
         cost=_cost(record),
         provenance=_provenance(record),
-        outcomes={
-            outcome: tuple(verdict.claim for verdict in verdicts if verdict.outcome == outcome)
-            for outcome in claims.OUTCOMES
-        },
     )
-
-
-def _points(record: SweepRecord) -> list[Point]:
-    """Return head sets and fractions of the plan: most data first, head sets in the order of the study."""
-    heads = [name for name in HEAD_SETS if name in record.grid.heads]
-    return [(name, fraction) for fraction in sorted(record.grid.fractions, reverse=True) for name in heads]
 
 
 def _sweep(record: SweepRecord, design: Literal["A", "B"]) -> Sweep:
@@ -112,7 +97,7 @@ def _sweep(record: SweepRecord, design: Literal["A", "B"]) -> Sweep:
         policy_seeds=grid.policy_seeds,
         policy_epochs=record.settings.policy.epochs,
         baseline=grid.baseline,
-        heads=tuple(name for name in HEAD_SETS if name in grid.heads),
+        heads=tuple(effects.ordered(grid.heads)),
         fractions=tuple(sorted(grid.fractions, reverse=True)),
         planned=len(record.planned),
         finished=len(record.planned) - len(missing),
@@ -125,59 +110,51 @@ def _sweep(record: SweepRecord, design: Literal["A", "B"]) -> Sweep:
 
 
 def _floor(record: SweepRecord) -> dict[str, float]:
-    """Return what no learning at all gives on the test frames."""
+    """Return what the best answer that ignores the input scores on the test frames, by metric."""
     for key, cell in record.planned.items():
         if key in record.results:
             steering = claims.steering_floor(record, (cell.heads, cell.fraction))
-            return {"accuracy": record.results[key].facts["floor"], "steering": steering}
-    return {"accuracy": math.nan, "steering": math.nan}
+            return {ACCURACY: record.results[key].facts["floor"], STEERING: steering}
+    return {ACCURACY: math.nan, STEERING: math.nan}
 
 
 def _ceiling(record: SweepRecord) -> Spread | None:
     """Return the accuracy of policies that are given the true state, where they were trained."""
-    if record.ceiling is None:
-        return None
-    table = record.table(ceiling=True)
-    (curves,) = learning_curves.panel(table[table["heads"] == CEILING], learning_curves.ACCURACY).values()
-    return _spread(curves)
+    return _spread(metrics.scores([record.ceiling], METRICS[ACCURACY])) if record.ceiling else None
 
 
-def _spread(curves: pd.DataFrame) -> Spread:
-    final = learning_curves.final(curves)
-    interval = intervals.mean_interval(final)
+def _spread(scores: pd.Series) -> Spread:
+    interval = intervals.mean_interval(scores)
     return Spread(
         mean=interval.value,
-        sd=float(final.std(ddof=1)) if len(final) > 1 else math.nan,
-        iqm=float(intervals.interquartile_mean(final.to_numpy())),
+        sd=float(scores.std(ddof=1)) if len(scores) > 1 else math.nan,
+        iqm=float(intervals.interquartile_mean(scores.to_numpy())),
         low=interval.low,
         high=interval.high,
         n=interval.n,
         kind=interval.kind,
-        units=learning_curves.by_seed(final).to_dict(),
+        units=learning_curves.by_seed(scores).to_dict(),
     )
 
 
-def _score(
-    record: SweepRecord, point: Point, cell: str, panels: Mapping[str, Panel], floor: float, ceiling: Spread | None
-) -> Score:
+def _score(record: SweepRecord, point: Point, cell: str, floor: float, ceiling: Spread | None) -> Score:
     results = effects.results_at(record, point)
-    guesses = [(item.predictions["acceleration"], item.predictions["acceleration_label"]) for item in results]
-    recall = np.concatenate([predictions.confusion(guess, label) for guess, label in guesses]).mean(axis=0)
-    scores = {name: _spread(curves[point]) for name, curves in panels.items() if point in curves}
-    gain = scores["accuracy"].mean - floor
+    recall = [
+        predictions.confusion(result.predictions["acceleration"], result.predictions["acceleration_label"])
+        for result in results
+    ]
+    scores = {name: metrics.scores(results, metric) for name, metric in METRICS.items()}
+    gain = float(scores[ACCURACY].mean()) - floor
     return Score(
         cell=cell,
         heads=point[0],
         fraction=point[1],
-        encoders=learning_curves.encoders(panels["accuracy"][point]),
-        n=len(panels["accuracy"][point]),
-        accuracy=scores["accuracy"],
-        steering=scores["steering"],
-        balanced=scores.get("balanced"),
+        encoders=len(results),
+        n=len(scores[ACCURACY]),
+        metrics={name: _spread(values) for name, values in scores.items() if len(values)},
         gain=gain,
         share=gain / (ceiling.mean - floor) if ceiling and ceiling.mean > floor else math.nan,
-        macro_f1=float(np.concatenate([predictions.macro_f1(guess, label) for guess, label in guesses]).mean()),
-        confusion=recall.tolist(),
+        confusion=np.concatenate(recall).mean(axis=0).tolist(),
         classes=ACCELERATIONS,
     )
 
@@ -208,7 +185,7 @@ def _confounds(record: SweepRecord) -> Iterator[Confound]:
             here=confounds.value(record.settings, confound.setting),
             there=confounds.value(other.settings, confound.setting) if other else None,
             sweep=other.grid.name if other else confound.sweep,
-            floor=_floor(other)["accuracy"] if other else math.nan,
+            floor=_floor(other)[ACCURACY] if other else math.nan,
             contrasts=tuple(confounds.contrasts(record, other, confound)) if other else (),
         )
 
@@ -220,9 +197,10 @@ def _encoders(table: pd.DataFrame, cells: Mapping[Point, str]) -> Iterator[Encod
         if own.empty:
             continue
         last = own[own["epoch"] == own["epoch"].max()].groupby(["metric", "split"])["value"].mean()
+        names = {name.removeprefix("loss_") for name, _ in last.index if name.startswith("loss_")} - {"kl"}
         losses = {
             head: {split: last.get((f"loss_{head}", split), math.nan) for split in ("train", "test")}
-            for head in HEAD_SETS[heads].heads
+            for head in sorted(names, key=[*HEADS, *sorted(names)].index)
         }
         yield EncoderLosses(cell=cell, encoders=own["encoder_seed"].nunique(), losses=losses)
 
@@ -278,7 +256,6 @@ def _data(record: SweepRecord) -> Data:
 
 
 def _cost(record: SweepRecord) -> Cost:
-    estimates = [cell_cost(record.settings, cell, record.grid.policy_seeds) for cell in record.planned.values()]
     cells = []
     for key, cell in record.planned.items():
         if key not in record.results:
@@ -289,15 +266,16 @@ def _cost(record: SweepRecord) -> Cost:
             CellCost(
                 cell=cell.label,
                 **{stage: seconds.get(stage) for stage in ("encoder", "encode", "policies")},
-                whole=seconds.get("cell"),
+                total=seconds.get("cell"),
                 **{name: facts.get(name) for name in ("peak_bytes", "device", "precision", "threads")},
                 frames=facts.get("frames", {}).get("encoder_train"),
             )
         )
     return Cost(
         cells=tuple(cells),
-        seconds=sum(0.0 if math.isnan(row.whole) else row.whole for row in cells),
-        disk=total([data_cost(record.settings, recorded="writers" not in record.data), *estimates]).bytes,
+        seconds=sum(0.0 if math.isnan(row.total) else row.total for row in cells),
+        disk=data_cost(record.settings, recorded="writers" not in record.data).bytes
+        + RESULT_BYTES * len(record.planned),
         peak_bytes=max((row.peak_bytes or 0 for row in cells), default=None),
     )
 

@@ -1,67 +1,131 @@
-"""The document of a report, from its text in `report.md.jinja`."""
+"""The documents of a report and of a comparison, from their texts in the `.md.jinja` files."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, StrictUndefined
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from study.analysis.claims import Verdict
+from study.analysis.metrics import Metric
 from study.report import rounding
-from study.report.document import Block, Inline, Picture, bold, code, parse, plain
-from study.report.model import Report
-from study.report.rounding import LOSS, NOTHING, UNITS, percent
+from study.report.document import Block, Inline, bold, code, italic, parse, plain, table
+from study.report.model import Report, Spread
+from study.report.rounding import LOSS, NOTHING, UNITS, interval, percent, show
 
-TEMPLATE = Path(__file__).with_name("report.md.jinja")
-ROUNDINGS = ("clock", "epochs", "fixed", "gigabytes", "interval", "kinds", "loss", "percent", "points", "probability")
+ROUNDINGS = ("clock", "epochs", "fixed", "gigabytes", "interval", "kinds", "percent", "points", "probability")
+
+
+def render(template: str, pictures: dict[str, str], **values: object) -> list[Block]:
+    """Return the document that a template makes of some values. `pictures`: the file of each figure that there is."""
+    # Not HTML: `plain` escapes what expressions give.
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        finalize=plain,
+        undefined=StrictUndefined,
+        autoescape=False,  # noqa: S701
+    )
+    environment.filters |= {name: getattr(rounding, name) for name in (*ROUNDINGS, "thousands")}
+    environment.filters |= {"code": code, "bold": bold, "inline": Inline, "counts": counts, "key_numbers": key_numbers}
+    environment.globals |= {name: getattr(rounding, name) for name in ("UNITS", "between", *ROUNDINGS)}
+    return list(parse(environment.get_template(template).render(**values), pictures))
 
 
 def document(report: Report) -> list[Block]:
-    """Return the document of a report. Its figures are the files `figures/<name>.svg`."""
-    # Not HTML: `plain` escapes what expressions give.
-    environment = Environment(finalize=plain, undefined=StrictUndefined, autoescape=False)  # noqa: S701
-    environment.filters |= {name: getattr(rounding, name) for name in (*ROUNDINGS, "whole")}
-    environment.filters |= {"code": code, "bold": bold, "key_numbers": key_numbers}
-    environment.globals |= {name: getattr(rounding, name) for name in ("LOSS", "UNITS", "between", *ROUNDINGS)}
-    template = environment.from_string(TEMPLATE.read_text(encoding="utf-8"))
-    pictures: dict[str, list[Picture]] = {}
-    for item in report.figures:
-        picture = Picture(f"figures/{item.name}.svg", plain(item.caption), plain(item.alt))
-        pictures.setdefault(item.place, []).append(picture)
-    return list(parse(template.render(report=report, **_lists(report)), pictures))
+    """Return the document of a report. Its figures are the files `figures/NAME.svg`."""
+    return render(
+        "report.md.jinja", {name: f"figures/{name}.svg" for name in report.figures}, report=report, **_lists(report)
+    )
 
 
 def _lists(report: Report) -> dict[str, Any]:
-    """Return what the text lists: sentences' enumerations, settings by name, and the labels of each set of frames."""
+    """Return what the text lists: sentences' enumerations, tables by metric, settings by name, labels of each set."""
     sweep = report.sweep
     ends = [row for row in report.scores if row.fraction in (sweep.fractions[0], sweep.fractions[-1])]
     over = (f"{row.n} policies on {'one encoder' if row.encoders == 1 else f'{row.encoders} encoders'}" for row in ends)
-    drives = (str(row.episodes.n) for row in report.accuracy_contrasts if row.episodes)
     unseen = (
         f"{code(row.setting)}, by {code(f'python -m study.sweep {row.sweep} --profile {sweep.profile}')}"
         for row in report.confounds
         if not row.contrasts
     )
-    scores = (f"{row.cell} {percent(row.accuracy.mean)} % (sd {percent(row.accuracy.sd, 2)})" for row in ends)
-    outcomes = (f"{len(names)} {outcome} ({', '.join(names)})" for outcome, names in report.outcomes.items() if names)
+    main = [metric for metric in report.metrics if metric.guess]
+    further = [metric for metric in report.metrics if not metric.guess]
     return {
         "hundredths": partial(percent, digits=2),
         "fractions": ", ".join(f"{round(100 * fraction, 2):g} %" for fraction in sweep.fractions),
-        "outcomes": "; ".join(outcomes),
+        "outcomes": "; ".join(f"{len(names)} {word} ({', '.join(names)})" for word, names in report.outcomes.items()),
         "ends_over": " or ".join(dict.fromkeys(over)),
-        "ends": "; ".join(scores),
-        "drives": " or ".join(dict.fromkeys(drives)),
-        "unseen": Inline("; ".join(unseen)),
+        "ends": "; ".join(f"{row.cell} {percent(row.accuracy.mean)} % ({percent(row.accuracy.sd, 2)})" for row in ends),
+        "drives": counts(row.episodes.n for row in report.accuracy_contrasts if row.episodes),
+        "unseen": "; ".join(unseen),
+        "main": {"about": _about(main), "table": main_scores(report, main)},
+        "further": {"about": _about(further), "table": further_scores(report, further)},
+        "trained_heads": list(dict.fromkeys(head for row in report.encoders for head in row.losses)),
         "setting": {f"{row.group}.{row.name}": row.value for row in report.settings},
         "labels": [
             (name, "chosen" if kind == "all" else kind, labels)
-            for name, own in report.data.sets.items()
-            for kind, labels in {"candidates": own["candidates"], **(own["chosen"] or {})}.items()
+            for name, content in report.data.sets.items()
+            for kind, labels in {"candidates": content["candidates"], **(content["chosen"] or {})}.items()
             if labels and labels["frames"]
         ],
     }
+
+
+def _about(metrics: Iterable[Metric]) -> str:
+    return " ".join(filter(None, (metric.about for metric in metrics)))
+
+
+def title(metric: Metric) -> Inline:
+    """Return a metric's column title, with its unit."""
+    return Inline(f"{plain(metric.title)} [{plain(metric.unit)}]" if metric.unit else plain(metric.title))
+
+
+def main_scores(report: Report, metrics: Sequence[Metric]) -> Inline:
+    """Return the table of the metrics that have a floor, with the ceiling's and the floor's rows."""
+    header, floor = ["Cell", "n"], [italic("floor"), ""]
+    top = [italic("ceiling (true state)"), report.ceiling.n if report.ceiling else NOTHING]
+    rows: list[list[object]] = [[row.cell, row.n] for row in report.scores]
+    for index, metric in enumerate(metrics):
+        header += [title(metric), "sd", "interval"]
+        floor += [show(metric, report.floor.get(metric.name)), "", ""]
+        top += _spread_cells(metric, None if index else report.ceiling)
+        for row, score in zip(rows, report.scores, strict=True):
+            row.extend(_spread_cells(metric, score.metrics.get(metric.name)))
+        if not index:  # accuracy: of its gain above the floor, how much it is and could be
+            header += ["IQM", "gain", "share"]
+            floor += ["", percent(0), percent(0, 0)]
+            top += ["", "", percent(1, 0)]
+            for row, score in zip(rows, report.scores, strict=True):
+                row.extend([percent(score.accuracy.iqm, 2), percent(score.gain), percent(score.share, 0)])
+    return table(header, [*rows, *[top] * (report.ceiling is not None), floor])
+
+
+def _spread_cells(metric: Metric, spread: Spread | None) -> list[str]:
+    """Return mean, standard deviation and interval of a score."""
+    if spread is None:
+        return [NOTHING] * 3
+    return [show(metric, spread.mean), show(metric, spread.sd), interval(spread, partial(show, metric))]
+
+
+def further_scores(report: Report, metrics: Sequence[Metric]) -> Inline:
+    """Return the table of the other metrics."""
+    rows = [
+        [score.cell, score.n, *(_mean_and_sd(metric, score.metrics.get(metric.name)) for metric in metrics)]
+        for score in report.scores
+    ]
+    return table(["Cell", "n", *map(title, metrics)], rows)
+
+
+def _mean_and_sd(metric: Metric, spread: Spread | None) -> str:
+    return f"{show(metric, spread.mean)} ({show(metric, spread.sd)})" if spread else NOTHING
+
+
+def counts(numbers: Iterable[int]) -> str:
+    """Return each of some numbers once."""
+    return " or ".join(map(str, sorted(set(numbers))))
 
 
 def key_numbers(claim: Verdict) -> str:
