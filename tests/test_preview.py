@@ -9,8 +9,7 @@ from PIL import Image
 from study.config.settings import BirdviewSettings
 from study.data.birdview import Renderer
 from study.data.frames import open_frames, unpack_masks
-from study.data.preview import LIGHTS, choose_ego, label_text, sample, write_film, write_preview
-from study.episode.schema import RED
+from study.data.preview import choose_ego, label_text, sample, write_film, write_preview
 from study.errors import BadInputError
 from tests.support.drives import crossing_drive
 
@@ -60,17 +59,6 @@ def test_the_film_shows_the_egos_bird_view_in_real_time(tmp_path):
         shown = np.asarray(film.convert("RGB"))[2:256:4, 2:256:4].astype(int)
     (view,), _ = Renderer(episode, VIEW).render(np.array([[steps[10], ego]]))
     assert np.abs(shown - view).mean() < 4  # the film has one palette
-
-
-def test_lights_are_on_the_map_in_their_colours(tmp_path):
-    episode = crossing_drive(steps=20)
-    red = dataclasses.replace(episode, light_state=np.full_like(episode.light_state, RED))
-    none = dataclasses.replace(red, routes=tuple(route[:0] for route in red.routes))
-    write_film(none, VIEW, tmp_path / "a.gif")
-    with Image.open(tmp_path / "a.gif") as film:
-        chart = np.asarray(film.convert("RGB"))[:, 264:].astype(int)
-    near = [(np.abs(chart - colour).max(axis=2) < 24).sum() for colour in LIGHTS]
-    assert near[0] == 0 < 4 * 12 <= near[2]
 
 
 def test_an_agent_that_may_not_be_ego_is_not_followed():

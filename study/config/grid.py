@@ -13,7 +13,7 @@ Fraction = Annotated[float, Field(gt=0, le=1)]
 
 
 class Rules(Settings):
-    """When a claim counts as reproduced, decided before the run (PAPER.md section 3; used by `study.analysis.claims`).
+    """When a claim counts as reproduced, decided before the run (docs/paper.md; used by `study.analysis.claims`).
 
     A sweep file gives each rule a number, or one for each profile: `{smoke: 0.1, laptop: 0.015}`; a profile that is not
     named takes the largest.

@@ -86,9 +86,9 @@ def load_heads(modules: Iterable[str]) -> None:
                 f"head module '{name}' cannot be used: {error}; it needs HEADS and HEAD_SETS, tuples of records, and "
                 "must be found by Python where the sweep starts and on every worker"
             ) from error
-        for records, known in further:
+        for records, registry in further:
             for record in records:
-                if known.setdefault(record.name, record) != record:
+                if registry.setdefault(record.name, record) != record:
                     raise BadInputError(f"head module '{name}': there is another '{record.name}'; choose another name")
                 for head in getattr(record, "heads", ()):
                     if head not in HEADS:

@@ -88,7 +88,7 @@ class BirdviewSettings(Settings):
 
 
 class FramesSettings(Settings):
-    """Which recorded moments become frames, and how they are split (Sec. IV-A, V; PAPER.md 2.7 to 2.9)."""
+    """Which recorded moments become frames, and how they are split (Sec. IV-A, V; docs/paper.md)."""
 
     encoder: Annotated[int, Field(ge=10)] = Field(25_000, description="frames of the encoder set, train and test")
     policy: Annotated[int, Field(ge=10)] = Field(

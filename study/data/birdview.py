@@ -1,11 +1,11 @@
-"""Bird view: an Episode's moments as images and masks (Sec. III-A). Reads Episodes only, never the simulator.
+"""Bird view: moments of an Episode as images and masks (Sec. III-A).
 
 Layers, in paint order: map (drivable surface, road boundary, lane lines), the planned way ahead (green, or red by the
 light that governs it), other vehicles' past and present poses (yellow), the ego's (blue). Everything is painted with
 hard edges at `settings.render` pixels a side, as indices into a palette, and area-averaged to 64.
 
-The map does not change during a drive, so it is painted once for the whole Episode; a frame cuts its window out of
-that picture and paints the moving things into it.
+The map does not change during a drive, so it is painted once for each Episode; a frame cuts its window out of that
+picture and paints the moving things into it.
 """
 
 from __future__ import annotations
@@ -58,24 +58,24 @@ def check_rate(episode: Episode) -> None:
 
 
 def valid_moments(episode: Episode, settings: BirdviewSettings) -> Moments:
-    """Moments (step, agent index) [M, 2] int64 that may become frames, sorted.
+    """Return the moments (step, agent index) [M, 2] int64 that may become frames, sorted.
 
-    The agent may be ego, is there during all of its history and future, and its steering and acceleration are known.
+    The agent may be ego, is present during its history and future, and its steering and acceleration are known.
     """
     check_rate(episode)
     before, after = settings.history, settings.future
-    there = np.pad(episode.present.cumsum(axis=0, dtype=np.int64), ((1, 0), (0, 0)))
+    presence = np.pad(episode.present.cumsum(axis=0, dtype=np.int64), ((1, 0), (0, 0)))
     span = before + after + 1
     good = np.zeros_like(episode.present)
     if episode.steps >= span:
-        good[before : episode.steps - after] = there[span:] - there[:-span] == span
+        good[before : episode.steps - after] = presence[span:] - presence[:-span] == span
     good &= np.array([agent.ego for agent in episode.agents], bool)
     good &= np.isfinite(episode.steering) & np.isfinite(episode.acceleration)
     return np.argwhere(good).astype(np.int64, copy=False)
 
 
 def governing_light(episode: Episode, settings: BirdviewSettings, moments: Moments) -> NDArray[np.uint8]:
-    """State [M] uint8 of the light that governs each moment's ego: GREEN where there is none within `light_range`."""
+    """Return the state [M] uint8 of each governing light, GREEN where there is none within `light_range`."""
     steps, agents = moments[:, 0], moments[:, 1]
     light = episode.light[steps, agents]
     near = (light >= 0) & (episode.light_distance[steps, agents] <= settings.light_range)  # an unknown distance is not
@@ -93,7 +93,7 @@ class _Window:
     row: float
 
     def affines(self, x: Floats, y: Floats, heading: Floats) -> Floats:
-        """World [m] -> pixel centres [M, 2, 3] for egos [M], heading up; left of the ego is left in the picture."""
+        """Return the maps from the world [m] to pixel centres [M, 2, 3] for egos [M]; they look up."""
         east, north = self.scale * np.cos(heading), self.scale * np.sin(heading)
         column = np.stack([north, -east, self.column - 0.5 - north * x + east * y], axis=1)
         row = np.stack([-east, -north, self.row - 0.5 + east * x + north * y], axis=1)
@@ -190,7 +190,7 @@ class Renderer:
     def _boxes(
         self, moments: Moments, affines: Floats, heading: Floats
     ) -> tuple[list[NDArray[np.int32]], list[int], list[list[int]]]:
-        """Boxes in paint order, frame by frame, with palette indices; for each frame the ends of its three parts.
+        """Return boxes in paint order, frame by frame, their palette indices, and the ends of each frame's three parts.
 
         The parts are past and present poses, the others' next poses, the ego's next poses.
         """
@@ -232,11 +232,11 @@ class Renderer:
         number[frame, pose, agent] = np.arange(len(frame))
         younger = number[frame, pose + 1, agent]
         hidden = (younger >= 0) & (pose != history) & (fixed == fixed[younger]).all(axis=(1, 2))
-        own = agent == moments[frame, 1]
-        layer = np.where(pose <= history, 0, 2) + own  # others' past, ego's past, pred, plan
+        is_ego = agent == moments[frame, 1]
+        layer = np.where(pose <= history, 0, 2) + is_ego  # others' past, ego's past, pred, plan
         order = np.lexsort((pose, layer, frame))
         order = order[~hidden[order]]
-        colour = _OTHERS + pose + own * (history + 1)
+        colour = _OTHERS + pose + is_ego * (history + 1)
         part = (frame * 3 + np.maximum(layer - 1, 0))[order]
         ends = np.searchsorted(part, np.arange(len(moments) * 3), side="right").reshape(-1, 3)
         return list(fixed[order]), colour[order].tolist(), ends.tolist()
@@ -255,7 +255,7 @@ class Renderer:
 
 
 def _palette(history: int) -> Image:
-    """Colours [3, 256] RGB by palette index. Past poses fade to black, linear in their age."""
+    """Return the colours [3, 256] RGB by palette index. Past poses fade to black, linear in their age."""
     if _OTHERS + 2 * (history + 1) > 256:
         raise BadInputError(f"birdview.history: at most {(256 - _OTHERS) // 2 - 1} past poses, got {history}")
     colours = np.zeros((256, 3), np.uint8)
@@ -270,7 +270,7 @@ def _palette(history: int) -> Image:
 
 
 def _shrink(picture: Image) -> Image:
-    """The area average [64, 64] of a square picture. Halving twice is four times faster than one step by four."""
+    """Return the area average [64, 64] of a square picture; to halve twice is four times faster than one step."""
     while picture.shape[0] % (2 * IMAGE) == 0:
         side = picture.shape[0] // 2
         picture = cv2.resize(picture, (side, side), interpolation=cv2.INTER_AREA)
@@ -300,7 +300,7 @@ class _Map:
             _paint(self._picture, self._shapes, affine, scale)
 
     def cuts(self, affines: Floats) -> Floats:
-        """Pixels of the window -> pixels of the large picture [M, 2, 3], for world [m] -> pixels of the window."""
+        """Return the maps from the window to the large picture [M, 2, 3], in pixels, of the maps from the world [m]."""
         back = affines[:, :, :2].transpose(0, 2, 1) / self._scale  # a turn times scale: its inverse, times scale
         shift = -back @ affines[:, :, 2:] - (self._origin * self._scale + 0.5)[:, None]
         return np.concatenate([back, shift], axis=2)
@@ -319,14 +319,14 @@ class _Map:
 
 
 def _shapes(lanes: Sequence[Lane]) -> list[_Shape]:
-    """What is painted of the lanes, in paint order: surfaces, boundaries, lane lines."""
+    """Return the shapes of the lanes in paint order: surfaces, boundaries, lane lines."""
     if not lanes:
         return []
     centre = np.concatenate([lane.centre for lane in lanes])
     lane_of = np.repeat(np.arange(len(lanes)), [len(lane.centre) for lane in lanes])
     new = np.diff(lane_of, prepend=-1) > 0
-    fresh = new | (np.diff(centre, axis=0, prepend=np.nan) != 0).any(axis=1)  # a point twice has no direction
-    centre, lane_of = centre[fresh], lane_of[fresh]
+    distinct = new | (np.diff(centre, axis=0, prepend=np.nan) != 0).any(axis=1)  # a point twice has no direction
+    centre, lane_of = centre[distinct], lane_of[distinct]
     starts = np.searchsorted(lane_of, np.arange(len(lanes) + 1))
     here = np.arange(len(centre))
     after, before = np.minimum(here + 1, starts[lane_of + 1] - 1), np.maximum(here - 1, starts[lane_of])

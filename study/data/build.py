@@ -96,8 +96,8 @@ class _Build:
     @property
     def inputs(self) -> str:
         """Return the digest of everything that decides the bytes of the store."""
-        own = {**self.settings, "sources": self.sources, **({"masks": further_masks()} if further_masks() else {})}
-        return content_key("frames", own, (), FORMAT_VERSIONS["frames"])
+        inputs = {**self.settings, "sources": self.sources, **({"masks": further_masks()} if further_masks() else {})}
+        return content_key("frames", inputs, (), FORMAT_VERSIONS["frames"])
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:

@@ -142,7 +142,7 @@ def _open_set(folder: Path, entry: dict[str, Any], *, check: bool) -> Frames:
         try:
             array = np.load(path, mmap_mode="r", allow_pickle=False)
         except (OSError, ValueError, EOFError) as error:
-            raise DamagedFramesError(f"{path} is no whole array ({error}); {remedy}") from error
+            raise DamagedFramesError(f"{path} is no complete array ({error}); {remedy}") from error
         expected = (entry["frames"], *shape)
         if array.shape != expected or array.dtype != np.uint8:
             raise DamagedFramesError(

@@ -33,14 +33,14 @@ def true_state(labels: pd.DataFrame, sources: Sequence[Mapping[str, str]], drive
     Raises BadInputError when a drive is missing or has changed.
     """
     train = labels["train"].to_numpy()
-    own = {name: labels[name].to_numpy(np.float64) for name in RAMPS}
+    values_of = {name: labels[name].to_numpy(np.float64) for name in RAMPS}
     light = labels["light"].to_numpy()
     parts = [np.stack([light == state for state in range(3)], axis=1)]
     for name, count in RAMPS.items():
-        parts += [] if name == "speed" else [np.isnan(own[name])[:, None]]
-        high = float(own[name][train].max()) if name == "speed" else FAR
-        parts.append(_ramps(np.nan_to_num(own[name], nan=FAR), high, count))
-    parts.append(own["speed"][:, None] - _past_speed(labels, sources, drives))
+        parts += [] if name == "speed" else [np.isnan(values_of[name])[:, None]]
+        high = float(values_of[name][train].max()) if name == "speed" else FAR
+        parts.append(_ramps(np.nan_to_num(values_of[name], nan=FAR), high, count))
+    parts.append(values_of["speed"][:, None] - _past_speed(labels, sources, drives))
     values = np.concatenate(parts, axis=1).astype(np.float64)
     spread = values[train].std(axis=0)
     scaled = (values - values[train].mean(axis=0)) / np.where(spread > 0, spread, 1.0)
