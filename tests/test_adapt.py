@@ -15,8 +15,10 @@ from study.data.frames import open_frames
 from study.data.prepare import data_flow
 from study.engine.flows import run_flow
 from study.episode.adapt import STEERING_UNIT, adapt, derived_commands
-from study.episode.files import file_digest, read_episode, write_episode
-from study.episode.imported import import_drives, open_import
+from study.episode.files import read_episode, write_episode
+from study.episode.head import file_digest
+from study.episode.imported import open_import
+from study.episode.importing import import_drives
 from study.errors import BadInputError
 from study.sim import autopilot
 from study.sim.record import record_episode

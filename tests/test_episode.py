@@ -7,7 +7,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from study.episode.files import FILES, file_digest, read_episode, write_episode
+from study.episode.files import FILES, read_episode, write_episode
+from study.episode.head import file_digest
 from study.episode.schema import Episode
 from study.errors import BadInputError
 from tests.support.drives import crossing_drive

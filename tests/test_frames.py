@@ -19,7 +19,8 @@ from study.data.frames import epoch_order, open_frames, unpack_masks
 from study.data.selection import LABELS
 from study.engine.flows import run_flow
 from study.engine.local import local_engine
-from study.episode.files import episode_digest, read_episode
+from study.episode.files import read_episode
+from study.episode.head import episode_digest
 from study.errors import BadInputError
 from tests.support.drives import bird_view, write_drives
 

@@ -10,7 +10,8 @@ from study.config.keys import FORMAT_VERSIONS
 from study.config.settings import BirdviewSettings, FramesSettings
 from study.data.selection import candidates
 from study.data.true_state import true_state
-from study.episode.files import episode_digest, read_episode
+from study.episode.files import read_episode
+from study.episode.head import episode_digest
 from study.errors import BadInputError
 from tests.support.drives import write_drives
 

@@ -23,7 +23,7 @@ from study.console.display import Display
 from study.console.options import Parser, add_options, run, study_overrides
 from study.data.prepare import data_flow, drives_flow, drives_folder
 from study.engine.flows import run_flow
-from study.episode.imported import describe, import_drives, open_import
+from study.episode.imported import open_import
 from study.errors import BadInputError
 from study.stages import Flow, data_cost, recording_cost
 
@@ -64,6 +64,8 @@ def main(args: Sequence[str]) -> int:
     if options.action != "import" and options.folder is not None:
         raise BadInputError(f"'{options.folder}' is one word too many; only import takes a DIR")
     if options.action == "import":
+        from study.episode.importing import describe, import_drives  # noqa: PLC0415 - arrays, which --help can do without
+
         made = import_drives(options.folder, options.out or DATA / "imported" / options.folder.resolve().name)
         print(describe(made))
         print(made.folder)

@@ -23,7 +23,8 @@ from study.config.settings import BirdviewSettings, FramesSettings
 from study.data.birdview import Renderer
 from study.data.frames import PARTS, SCHEMA_VERSION, DamagedFramesError, open_frames, shapes
 from study.data.selection import LABELS, SETS, Columns, candidates, choose, histograms
-from study.episode.files import episode_digest, file_digest, read_episode
+from study.episode.files import read_episode
+from study.episode.head import episode_digest, file_digest
 from study.errors import BadInputError
 from study.stages import RENDER, SELECT, Batch, Flow, Task
 

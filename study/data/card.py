@@ -21,7 +21,7 @@ from study.atomic import atomic_folder
 from study.config.paper import ACCELERATIONS, IMAGE
 from study.data.frames import Frames, FrameStore
 from study.data.selection import SETS
-from study.episode.files import episode_digest
+from study.episode.head import episode_digest
 
 FILES = ("card.json", "card.txt", "card.png")
 VIEW_DRIVES, VIEW_FRAMES = 8, 1000  # of each set, in which the agents in view are counted

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from study.config.paper import IMAGE
 from study.data.birdview import MASK_BYTES
 from study.data.selection import LABELS, SETS, Indices
-from study.episode.files import file_digest
+from study.episode.head import file_digest
 from study.errors import BadInputError
 
 SCHEMA_VERSION = 1

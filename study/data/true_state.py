@@ -15,7 +15,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from study.config.paper import LATENT
-from study.episode.files import episode_digest, read_episode
+from study.episode.files import read_episode
+from study.episode.head import episode_digest
 from study.errors import BadInputError
 
 PAST = 10  # steps at 10 Hz: the past second

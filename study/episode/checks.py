@@ -1,4 +1,4 @@
-"""Check that an Episode keeps its format's promises."""
+"""Check that an Episode is what its format promises."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ REACH = 10_000.0  # [m] within which float32 keeps the millimetre
 
 
 def check_episode(episode: Episode, source: str) -> None:
-    """Raise BadInputError, naming field, step and agent, when an Episode holds what cannot be."""
+    """Raise BadInputError, naming field, step and agent, when an Episode holds impossible values."""
 
     def refuse(what: str) -> None:
         raise BadInputError(f"{source}: {what}")
@@ -56,7 +56,7 @@ def _check_map(episode: Episode, refuse: Any) -> None:
             refuse(f"light {light.id}: the stop line is not finite")
 
 
-def _check_states(episode: Episode, refuse: Any) -> None:  # noqa: ANN401
+def _check_states(episode: Episode, refuse: Any) -> None:
     present = episode.present
 
     def where(bad: NDArray[np.bool_], name: str, rule: str) -> None:
@@ -80,17 +80,17 @@ def _check_states(episode: Episode, refuse: Any) -> None:  # noqa: ANN401
         _check_units(episode, where)
 
 
-def _check_units(episode: Episode, where: Any) -> None:  # noqa: ANN401
-    """Speed against displacement: a drive in km/h or in feet must not pass for one in m/s and metres."""
+def _check_units(episode: Episode, where: Any) -> None:
+    """Compare speed with displacement: a drive in km/h or in feet must not pass for one in m/s and metres."""
     both = episode.present[1:] & episode.present[:-1]
     with np.errstate(invalid="ignore"):
         moved = np.hypot(np.diff(episode.x, axis=0), np.diff(episode.y, axis=0)) * episode.rate_hz
-        said = (np.abs(episode.speed[1:]) + np.abs(episode.speed[:-1])) / 2
-    moved, said = np.where(both, moved, 0), np.where(both, said, 0)
-    if said.sum() + moved.sum() < both.sum() * 0.2:  # next to nothing moves: no statement possible
+        speed = (np.abs(episode.speed[1:]) + np.abs(episode.speed[:-1])) / 2
+    moved, speed = np.where(both, moved, 0), np.where(both, speed, 0)
+    if speed.sum() + moved.sum() < both.sum() * 0.2:  # hardly anything moves: there is nothing to compare
         return
-    ratio = said.sum() / max(float(moved.sum()), 1e-9)
+    ratio = speed.sum() / max(float(moved.sum()), 1e-9)
     if not 2 / 3 < ratio < 1.5:
         bad = np.zeros_like(episode.present)
-        bad[1:] = both & (np.abs(said - moved) == np.abs(said - moved).max())
+        bad[1:] = both & (np.abs(speed - moved) == np.abs(speed - moved).max())
         where(bad, "speed", f"does not fit the positions: speeds are {ratio:.2f} times the distance moved per second")

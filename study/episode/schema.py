@@ -41,6 +41,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 SCHEMA_VERSION = 1
+RATE_HZ = 10.0  # of history and future (Sec. III-A)
 GREEN, YELLOW, RED = 0, 1, 2
 LABELS = ("recorded", "derived", "none")
 OPTIONAL_FLOATS = ("steering", "acceleration", "light_distance", "route_s", "lead_gap")
@@ -83,7 +84,7 @@ class Agent:
 
 @dataclass(frozen=True)
 class Episode:
-    """One recorded drive, dense in memory: T steps, A agents, L lights; values where `present` is false mean nothing.
+    """One recorded drive, dense in memory: T steps, A agents, L lights; where `present` is false, values mean nothing.
 
     `x`, `y`, `heading`, `speed`, `steering`, `acceleration`, `light_distance`, `route_s`, `lead_gap`: [T, A] float32,
     NaN where unknown. `light`: [T, A] int32, an index into `lights`, -1 for none. `light_state`: [T, L] uint8.
@@ -114,15 +115,12 @@ class Episode:
 
     @property
     def steps(self) -> int:
-        """T, the number of steps."""
+        """Return T, the number of steps."""
         return len(self.present)
 
 
 def empty_states(steps: int, agents: int) -> dict[str, Any]:
-    """Arrays [T, A] of an Episode in which nothing is known and nobody is present, to be filled by a writer."""
+    """Return arrays [T, A] of an Episode in which nothing is known and no agent is present, for a writer to fill."""
     names = ("x", "y", "heading", "speed", *OPTIONAL_FLOATS)
     arrays: dict[str, Any] = {name: np.full((steps, agents), np.nan, np.float32) for name in names}
     return arrays | {"present": np.zeros((steps, agents), bool), "light": np.full((steps, agents), -1, np.int32)}
-
-
-RATE_HZ = 10.0  # of history and future (Sec. III-A)

@@ -1,4 +1,4 @@
-"""What a cell leaves behind: a plain value that can be saved, moved between machines and loaded without torch."""
+"""The result of a cell: a plain value that can be saved, moved between machines and loaded without torch."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ HEAD = "cell.json"
 
 @dataclass(frozen=True)
 class CellResult:
-    """One trained encoder and the policies on it. S policy seeds, N test frames of the policy set, K sample frames.
+    """A trained encoder and the policies on it. S policy seeds, N test frames of the policy set, K sample frames.
 
     The ceiling, policies on the true state, has neither an encoder nor samples nor curves of an encoder.
 
@@ -67,32 +67,33 @@ class CellResult:
 
     @staticmethod
     def load(folder: Path) -> CellResult:
-        """Read what `save` wrote. Raises BadInputError when it is not whole."""
+        """Read what `save` wrote. Raises BadInputError when it is damaged."""
         try:
             head, parts, curves = read_product(folder, HEAD, ARRAYS)
         except BadInputError as error:
             raise BadInputError(f"{error}; run the cell again") from error
         if head.get("format_version") != FORMAT_VERSION:
-            found = head.get("format_version")
-            raise BadInputError(f"{folder}: format {found}; this program reads {FORMAT_VERSION}; run the cell again")
+            raise BadInputError(
+                f"{folder}: format {head.get('format_version')}; this program reads {FORMAT_VERSION}; run the cell again"
+            )
         try:
-            own = {name: head[name] for name in ("settings", "facts")}
-            return CellResult(Cell.model_validate(head["cell"]), str(head["key"]), curves=curves, **own, **parts)
+            cell, settings, facts = Cell.model_validate(head["cell"]), head["settings"], head["facts"]
+            return CellResult(cell, str(head["key"]), settings, curves, **parts, facts=facts)
         except (ValueError, KeyError) as error:
             raise BadInputError(f"{folder} is not a whole cell result: {error}; run the cell again") from error
 
 
 def load_results(folder: Path) -> Iterator[CellResult]:
-    """The results below `folder`, each in a folder named by its key, one after the other, checked.
+    """Yield the checked results below `folder`, each in a folder named by its key.
 
     Raises BadInputError when there are none, and for one that is not whole or not what its own settings make.
     """
     if not folder.is_dir():
         raise BadInputError(f"{folder} is no folder; name the one that 'python -m study.sweep train' wrote with --out")
-    found = sorted(path.parent for path in folder.glob("*/cell.json"))
-    if not found:
+    paths = sorted(path.parent for path in folder.glob("*/cell.json"))
+    if not paths:
         raise BadInputError(f"{folder} holds no cell results; name the folder that 'python -m study.sweep train' wrote")
-    for path in found:
+    for path in paths:
         result = CellResult.load(path)
         if result.key != path.name:
             raise BadInputError(f"{path} holds the result of cell {result.key}; give the folder its own name again")
@@ -105,26 +106,26 @@ def load_results(folder: Path) -> Iterator[CellResult]:
 
 def _check(result: CellResult) -> None:
     """Raise ValueError, KeyError or TypeError where a result does not fit its own settings."""
-    own = dict(result.settings)
-    seeds, frames = own.pop("policy_seeds"), own.pop("frames_key")
-    settings = StudySettings.model_validate(own)
+    groups = dict(result.settings)
+    seeds, frames = groups.pop("policy_seeds"), groups.pop("frames_key")
+    settings = StudySettings.model_validate(groups)
     if cell_key(settings, result.cell, seeds, frames) != result.key:
         raise ValueError("its settings have another key")
     if set(result.curves.columns) != set(CURVE_COLUMNS):
         raise ValueError(f"its curves have columns {', '.join(map(str, result.curves.columns))}")
     if not np.isfinite(result.curves["value"].to_numpy(np.float64)).all():
         raise ValueError("its curves hold values that are not finite")
-    for stage, wanted, epochs in (
+    for stage, policy_seeds, epochs in (
         ("encoder", [NO_SEED] * (result.cell.heads != CEILING), settings.encoder.epochs),
         ("policy", list(range(seeds)), settings.policy.epochs),
     ):
         rows = result.curves[result.curves["stage"] == stage]
-        if sorted(rows["policy_seed"].unique()) != wanted:
-            raise ValueError(f"its {stage} curves are not those of {len(wanted)} seeds")
+        if sorted(rows["policy_seed"].unique()) != policy_seeds:
+            raise ValueError(f"its {stage} curves are not those of {len(policy_seeds)} seeds")
         for names, points in rows.groupby(["split", "metric", "policy_seed"]):
             if sorted(points["epoch"]) != list(range(1, epochs + 1)):
                 raise ValueError(f"its {stage} curve {names} has not {epochs} epochs, each once")
     for name in ("acceleration", "steering"):
-        labels, guesses = result.predictions[f"{name}_label"], result.predictions[name]
-        if guesses.shape != (seeds, *labels.shape):
-            raise ValueError(f"its predictions of {name} are {guesses.shape} for {labels.shape} labels")
+        labels, predictions = result.predictions[f"{name}_label"], result.predictions[name]
+        if predictions.shape != (seeds, *labels.shape):
+            raise ValueError(f"its predictions of {name} are {predictions.shape} for {labels.shape} labels")

@@ -34,12 +34,12 @@ class SweepRecord:
 
     @property
     def complete(self) -> bool:
-        """Whether every planned cell is finished."""
+        """Return whether every planned cell is finished."""
         return set(self.planned) <= set(self.results)
 
     @property
     def ceiling(self) -> CellResult | None:
-        """What policies reach that are given the true state, where that cell is finished."""
+        """Return the result of policies on the true state, or None where that cell is not finished."""
         key = next((key for key, cell in self.planned.items() if cell.heads == CEILING), "")
         return self.results.get(key)
 
