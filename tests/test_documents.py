@@ -22,12 +22,14 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 from markdown.extensions.toc import slugify
 from mkdocs.commands.build import build
 from mkdocs.config import load_config
 
+from study.config.heads import HEAD_SETS, HEADS
 from study.config.settings import StudySettings
 from study.console.options import Parser
 from study.errors import BadInputError
@@ -83,7 +85,8 @@ def folder(tmp_path, monkeypatch):
     submit.chmod(0o755)
     monkeypatch.setenv("PATH", f"{submit.parent}:{os.environ['PATH']}")
     monkeypatch.chdir(tmp_path)
-    return tmp_path
+    with patch.dict(HEADS), patch.dict(HEAD_SETS):  # a sweep file may add to them
+        yield tmp_path
 
 
 def write_file(block: Block, folder: Path) -> None:
@@ -103,7 +106,7 @@ class ParsedError(Exception):
     """Ends a command as soon as its options are parsed and its plan is made."""
 
 
-def run_study(module: str, words: list[str], patch: pytest.MonkeyPatch) -> None:
+def run_study(module: str, words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """Run a study command as far as this costs nothing."""
     main = importlib.import_module(f"{module}.__main__").main
     if (module, words[0]) == ("study.data", "import"):
@@ -120,13 +123,13 @@ def run_study(module: str, words: list[str], patch: pytest.MonkeyPatch) -> None:
             given_plan(options)
         raise ParsedError
 
-    with patch.context() as context:
+    with monkeypatch.context() as context:
         context.setattr(Parser, "parse", stop)
         with pytest.raises(ParsedError):
             main(words)
 
 
-def run_commands(block: Block, folder: Path, patch: pytest.MonkeyPatch) -> None:
+def run_commands(block: Block, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Run the commands of a block by the rules at the head of this module."""
     commands = block.commands()
     if all(words[0] in SHELL_TOOLS for words in commands):
@@ -140,7 +143,7 @@ def run_commands(block: Block, folder: Path, patch: pytest.MonkeyPatch) -> None:
         else:
             assert words[:2] == ["python", "-m"], f"{block.place}: no rule runs '{words[0]}'; mark the block"
             assert words[2].startswith("study."), f"{block.place}: no rule runs '{words[2]}'; mark the block"
-            run_study(words[2], words[3:], patch)
+            run_study(words[2], words[3:], monkeypatch)
 
 
 # --- the tests ------------------------------------------------------------------------------------------------------
@@ -196,6 +199,8 @@ def test_what_the_pages_do_with_the_smoke_profile_works(folder):
     commands = [words for block in found if block.language == "bash" for words in block.commands()]
     smoke = [words for words in commands if "smoke" in words]
     assert len(smoke) >= 4
+    for words in [words for words in commands if words[0] == "cp"]:
+        subprocess.run(words, cwd=folder, check=True)
     for words in smoke:
         done = subprocess.run([sys.executable, *words[1:]], cwd=folder, capture_output=True, text=True, check=False)
         assert done.returncode == 0, f"{shlex.join(words)}\n{done.stderr}"
