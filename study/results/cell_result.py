@@ -72,11 +72,9 @@ class CellResult:
             head, parts, curves = read_product(folder, HEAD, ARRAYS)
         except BadInputError as error:
             raise BadInputError(f"{error}; run the cell again") from error
-        if head.get("format_version") != FORMAT_VERSION:
-            raise BadInputError(
-                f"{folder}: format {head.get('format_version')}, not {FORMAT_VERSION}, which this program reads; run the "
-                "cell again"
-            )
+        version = head.get("format_version")
+        if version != FORMAT_VERSION:
+            raise BadInputError(f"{folder}: format {version}; this program reads {FORMAT_VERSION}; run the cell again")
         try:
             cell, settings, facts = Cell.model_validate(head["cell"]), head["settings"], head["facts"]
             return CellResult(cell, str(head["key"]), settings, curves, **parts, facts=facts)
