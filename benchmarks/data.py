@@ -37,7 +37,7 @@ from study.episode.files import read_episode, write_episode
 from study.sim.autopilot import DT
 from study.sim.env import Traffic, make_traffic
 from study.sim.record import record_episode
-from study.stages import size
+from study.stages import size_text
 
 RESULT = Path(__file__).parent / "results" / "data.json"
 PROFILE = "paper"
@@ -275,7 +275,7 @@ def table(rounds: list[dict[str, float]]) -> str:
     lines = [f"{'stage':10}{'median':>10}{'low':>10}{'high':>10}  {'unit':18}memory"]
     for stage, unit in units.items():
         one = spread([values[stage] for values in rounds])
-        memory = size(max(values.get(f"{stage} bytes", 0) for values in rounds)) if stage != "ratio" else ""
+        memory = size_text(max(values.get(f"{stage} bytes", 0) for values in rounds)) if stage != "ratio" else ""
         lines.append(f"{stage:10}{one['median']:10,.0f}{one['low']:10,.0f}{one['high']:10,.0f}  {unit:18}{memory}")
     return "\n".join(lines)
 

@@ -1,4 +1,4 @@
-"""Folders that are written whole or not at all."""
+"""Write folders atomically."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ def read_product(
         arrays = {part: load_file(folder / f"{part}.safetensors") for part in parts}
         return head, arrays, pd.read_parquet(folder / TABLE)
     except (OSError, ValueError, TypeError, AttributeError, SafetensorError) as error:
-        raise BadInputError(f"{folder} is not a whole product: {error}") from error
+        raise BadInputError(f"{folder} is no complete product: {error}") from error
 
 
 def _digest(file: Path) -> str:

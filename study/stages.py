@@ -211,7 +211,7 @@ def total(costs: Iterable[Cost]) -> Cost:
     return Cost(sum(cost.seconds for cost in terms), sum(cost.bytes for cost in terms))
 
 
-def clock(seconds: float) -> str:
+def duration_text(seconds: float) -> str:
     """Return a time for people, e.g. `7 s`, `12 min`, `3 h 05 min`."""
     if seconds < 100:
         return f"{seconds:.0f} s"
@@ -219,6 +219,6 @@ def clock(seconds: float) -> str:
     return f"{minutes} min" if minutes < 100 else f"{minutes // 60} h {minutes % 60:02d} min"
 
 
-def size(count: float) -> str:
+def size_text(count: float) -> str:
     """Return a number of bytes for people, e.g. `310 MB`, `7.0 GB`."""
     return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"

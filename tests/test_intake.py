@@ -129,7 +129,7 @@ def edit(change):
 
 SPOILT = {
     "a flipped bit": (lambda folder: damage(folder / "encoder.safetensors"), "does not match its digest"),
-    "a missing file": (lambda folder: (folder / "curves.parquet").unlink(), "is not a whole product"),
+    "a missing file": (lambda folder: (folder / "curves.parquet").unlink(), "is no complete product"),
     "another name": (lambda folder: folder.rename(folder.with_name("0" * 16)), "give the folder its own name"),
     "another cell": (
         edit(lambda result: dataclasses.replace(result, cell=result.cell.model_copy(update={"encoder_seed": 7}))),

@@ -60,7 +60,7 @@ def test_damage_to_any_file_is_noticed(folder, file, how):
         path.unlink()
     else:
         path.write_bytes(content if how == "one bit" else content[:-9])
-    with pytest.raises(BadInputError, match="one is not a whole product"):
+    with pytest.raises(BadInputError, match="one is no complete product"):
         read(folder)
 
 
@@ -75,7 +75,7 @@ def test_files_of_two_products_do_not_make_one(folder, tmp_path):
 def test_a_foreign_head_is_refused(folder, head):
     (folder / "head.json").write_text(head)
     (folder / "weights.safetensors").unlink()
-    with pytest.raises(BadInputError, match="is not a whole product"):
+    with pytest.raises(BadInputError, match="is no complete product"):
         read(folder)
 
 
@@ -87,7 +87,7 @@ def test_a_product_without_digests_is_read(folder):
 
 
 def test_a_folder_that_does_not_exist_is_refused(tmp_path):
-    with pytest.raises(BadInputError, match="is not a whole product"):
+    with pytest.raises(BadInputError, match="is no complete product"):
         read(tmp_path / "nothing")
 
 

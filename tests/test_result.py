@@ -47,7 +47,7 @@ def test_an_incomplete_result_is_refused(folder, file, how):
         path.unlink()
     else:
         path.write_bytes(path.read_bytes()[:-9])
-    with pytest.raises(BadInputError, match=r"is not a whole product: .*; run the cell again"):
+    with pytest.raises(BadInputError, match=r"is no complete product: .*; run the cell again"):
         CellResult.load(folder)
 
 

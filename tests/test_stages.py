@@ -4,7 +4,18 @@ import pytest
 
 from study.config.grid import Cell
 from study.config.settings import StudySettings
-from study.stages import CELL_STAGES, DATA_STAGES, Cost, Work, cell_cost, clock, data_cost, share_done, size, total
+from study.stages import (
+    CELL_STAGES,
+    DATA_STAGES,
+    Cost,
+    Work,
+    cell_cost,
+    data_cost,
+    duration_text,
+    share_done,
+    size_text,
+    total,
+)
 
 
 def changed(**groups):
@@ -36,12 +47,12 @@ def test_costs_add_up():
 
 @pytest.mark.parametrize(("seconds", "text"), [(7, "7 s"), (720, "12 min"), (3 * 3600 + 300, "3 h 05 min")])
 def test_times_read_well(seconds, text):
-    assert clock(seconds) == text
+    assert duration_text(seconds) == text
 
 
 @pytest.mark.parametrize(("count", "text"), [(310e6, "310 MB"), (7e9, "7.0 GB")])
 def test_sizes_read_well(count, text):
-    assert size(count) == text
+    assert size_text(count) == text
 
 
 @pytest.mark.parametrize("stages", [CELL_STAGES, DATA_STAGES], ids=["cell", "data"])

@@ -277,12 +277,12 @@ PAPER_SETS = ("rec", "rec+pred", "rec+plan", "full")  # the paper's own: a furth
 REACH = {1.0: 0.2, 0.25: 0.4, 0.0625: 0.6}  # fraction -> share of the epochs that the text names (Sec. V-A, V-B)
 
 
-def _at_top(*names: tuple[str, str]) -> Callable[[Grid], list[Pair]]:
+def at_top(*names: tuple[str, str]) -> Callable[[Grid], list[Pair]]:
     """Return pairs of head sets, each with the largest fraction of the data."""
     return lambda grid: [((first, max(grid.fractions)), (second, max(grid.fractions))) for first, second in names]
 
 
-def _by_fraction(pairs: Callable[[Grid, Point], list[Pair]]) -> Callable[[Grid], list[Pair]]:
+def by_fraction(pairs: Callable[[Grid, Point], list[Pair]]) -> Callable[[Grid], list[Pair]]:
     """Return pairs of a grid with several fractions, given `rec` with the largest; none of a grid with one."""
     return lambda grid: pairs(grid, ("rec", max(grid.fractions))) if len(grid.fractions) > 1 else []
 
@@ -296,7 +296,7 @@ CLAIMS: dict[str, Claim] = {
             "Steering is good for all head sets: no meaningful difference in loss.",
             PAPER_SETS,
             SAME_STEERING,
-            _at_top(("rec+pred", "rec"), ("rec+plan", "rec"), ("full", "rec")),
+            at_top(("rec+pred", "rec"), ("rec+plan", "rec"), ("full", "rec")),
         ),
         Claim(
             "H2",
@@ -304,7 +304,7 @@ CLAIMS: dict[str, Claim] = {
             "Acceleration accuracy rises with the heads: full is best, then rec+plan, rec+pred, rec.",
             PAPER_SETS,
             ABOVE,
-            _at_top(("rec+pred", "rec"), ("rec+plan", "rec+pred"), ("full", "rec+plan")),
+            at_top(("rec+pred", "rec"), ("rec+plan", "rec+pred"), ("full", "rec+plan")),
         ),
         Claim(
             "H3",
@@ -312,7 +312,7 @@ CLAIMS: dict[str, Claim] = {
             "Adding plan helps acceleration more than adding pred.",
             ("rec+pred", "rec+plan"),
             ABOVE,
-            _at_top(("rec+plan", "rec+pred")),
+            at_top(("rec+plan", "rec+pred")),
         ),
         Claim(
             "H4",
@@ -320,7 +320,7 @@ CLAIMS: dict[str, Claim] = {
             "full reaches rec's final accuracy in about 20 of 100 epochs.",
             ("rec", "full"),
             REACHES,
-            _at_top(("full", "rec")),
+            at_top(("full", "rec")),
         ),
         Claim(
             "H5",
@@ -328,7 +328,7 @@ CLAIMS: dict[str, Claim] = {
             "rec has the largest variance while still converging.",
             PAPER_SETS,
             MORE_SPREAD,
-            _at_top(("rec", "rec+pred"), ("rec", "rec+plan"), ("rec", "full")),
+            at_top(("rec", "rec+pred"), ("rec", "rec+plan"), ("rec", "full")),
         ),
         Claim(
             "D1",
@@ -336,7 +336,7 @@ CLAIMS: dict[str, Claim] = {
             "Steering loss hardly changes with data size or head set.",
             ("rec", "full"),
             SAME_STEERING,
-            _by_fraction(
+            by_fraction(
                 lambda grid, base: [
                     ((heads, fraction), base)
                     for fraction in grid.fractions
@@ -351,7 +351,7 @@ CLAIMS: dict[str, Claim] = {
             "full beats rec at every data fraction.",
             ("rec", "full"),
             ABOVE,
-            _by_fraction(lambda grid, _: [(("full", fraction), ("rec", fraction)) for fraction in grid.fractions]),
+            by_fraction(lambda grid, _: [(("full", fraction), ("rec", fraction)) for fraction in grid.fractions]),
         ),
         Claim(
             "D3",
@@ -359,7 +359,7 @@ CLAIMS: dict[str, Claim] = {
             "full with the smallest fraction beats rec with all the data.",
             ("rec", "full"),
             ABOVE,
-            _by_fraction(lambda grid, base: [(("full", min(grid.fractions)), base)]),
+            by_fraction(lambda grid, base: [(("full", min(grid.fractions)), base)]),
         ),
         Claim(
             "D4",
@@ -367,7 +367,7 @@ CLAIMS: dict[str, Claim] = {
             "full reaches rec-at-100 %'s final accuracy in 20 of 100 epochs at 100 %, 40 at 25 %, 60 at 6.25 %.",
             ("rec", "full"),
             REACHES,
-            _by_fraction(
+            by_fraction(
                 lambda grid, base: [(("full", fraction), base) for fraction in REACH if fraction in grid.fractions]
             ),
         ),

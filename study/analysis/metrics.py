@@ -1,7 +1,7 @@
 """The metrics of policies on test frames: what each measures, and how a report shows it.
 
 To add a metric, write a function that returns one value for each policy of a cell, and add its record to `METRICS`.
-Tables, comparisons, report.json and MLflow's `final/NAME` derive from it.
+Tables, comparisons and report.json derive from it. A metric that has a curve is called as it is there and in MLflow.
 """
 
 from __future__ import annotations

@@ -34,7 +34,7 @@ from study.stages import ENCODER
 PROBED = ("speed", "light", "lead_gap")  # columns of the labels that reports probe the latents for
 ENCODER_CURVES = ["split", "epoch", "metric", "value"]  # columns
 
-Report = Callable[..., None]  # see `Task`
+Reporter = Callable[..., None]  # see `Task`
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Latents:
     facts: dict[str, Any]
 
 
-def train_cell_encoder(job: CellJob, report: Report) -> Product:
+def train_cell_encoder(job: CellJob, report: Reporter) -> Product:
     """Train the encoder. Raises BadInputError for settings that cannot be met, TrainingDivergedError for a bad loss."""
     store, device, facts = _begin(job, report)
     settings, cell = job.settings, job.cell
@@ -69,7 +69,7 @@ def train_cell_encoder(job: CellJob, report: Report) -> Product:
     return Product({"weights": trained.weights, "samples": trained.samples}, trained.curves, facts)
 
 
-def encode_policy_set(job: CellJob, encoder: Product | None, report: Report) -> Latents:
+def encode_policy_set(job: CellJob, encoder: Product | None, report: Reporter) -> Latents:
     """Return the latents of the policy set: the encoder's, or the true state."""
     started = time.perf_counter()
     store, device, facts = _begin(job, report)
@@ -87,7 +87,7 @@ def encode_policy_set(job: CellJob, encoder: Product | None, report: Report) -> 
     return Latents(z["train"], z["test"], labels["train"], labels["test"], facts)
 
 
-def train_policy_share(job: CellJob, latents: Latents, seeds: list[int], report: Report) -> Product:
+def train_policy_share(job: CellJob, latents: Latents, seeds: list[int], report: Reporter) -> Product:
     """Train the policies of these seeds."""
     trained = train_policies(
         latents.z_train,
@@ -162,7 +162,7 @@ def assemble_result(
     return result, export_driver(result) if encoder else b""
 
 
-def _begin(job: CellJob, report: Report) -> tuple[FrameStore, str, dict[str, Any]]:
+def _begin(job: CellJob, report: Reporter) -> tuple[FrameStore, str, dict[str, Any]]:
     """Return the frames, made here where they are missing, the device, and facts about what computes."""
     load_heads(job.head_modules)
     device = _set_up(job, report)
@@ -184,7 +184,7 @@ def _begin(job: CellJob, report: Report) -> tuple[FrameStore, str, dict[str, Any
     return store, device, {"device": device_name(device), "provenance": origin}
 
 
-def _set_up(job: CellJob, report: Report) -> str:
+def _set_up(job: CellJob, report: Reporter) -> str:
     """Set the number of threads, and return the device."""
     torch.set_num_threads(job.threads)
     device = choose_device(job.device)

@@ -7,7 +7,7 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Self
 
-from study.stages import CELL_STAGES, STAGES, Work, clock, share_done
+from study.stages import CELL_STAGES, STAGES, Work, duration_text, share_done
 
 if TYPE_CHECKING:  # plain lines need no rich, and a machine that only trains may lack it
     from rich.live import Live
@@ -141,7 +141,7 @@ class Display:
         left = self.left()
         said = [f"cells {self._finished}/{self._total}"] if self._total else []
         said += [f"{self._failed} failed"] if self._failed else []
-        said += [] if left is None else [f"about {clock(left)} left"]
+        said += [] if left is None else [f"about {duration_text(left)} left"]
         return ", ".join(said)
 
     def tick(self, *, now: bool = False) -> None:

@@ -15,7 +15,7 @@ from study.config.workspace import DATA
 from study.engine.flows import run_flow
 from study.episode.imported import Imported
 from study.errors import BadInputError
-from study.stages import Flow, data_cost, recording_cost, size
+from study.stages import Flow, data_cost, recording_cost, size_text
 
 POLICY_SEED = 1_000_000  # the policy set's drives are numbered from here: never those of the encoder set (Sec. V-A)
 
@@ -118,6 +118,6 @@ def _check_room(root: Path, need: int, taken: Sequence[Path]) -> None:
     need -= sum(path.stat().st_blocks * 512 for folder in taken for path in folder.rglob("*") if path.is_file())
     if need > free:
         raise BadInputError(
-            f"{root} has {size(free)} free and the data needs about {size(need)}: "
+            f"{root} has {size_text(free)} free and the data needs about {size_text(need)}: "
             "free some room, or lower --frames.encoder and --recording.encoder_episodes"
         )

@@ -35,7 +35,7 @@ from study.encoder.inputs import Split
 from study.encoder.latents import choose_samples, paint_samples
 from study.errors import BadInputError, TrainingDivergedError
 from study.products import Arrays
-from study.stages import size
+from study.stages import size_text
 
 Log = Callable[[int, dict[str, float]], None]
 Progress = Callable[[int, int], None]
@@ -65,7 +65,8 @@ def check_memory(device: torch.device, heads: str, batch: int, precision: str) -
     need = step_bytes(heads, batch, precision)
     if need > free:
         raise BadInputError(
-            f"{device} has {size(free)} of free memory, and batch {batch} with heads {heads} needs about {size(need)}; "
+            f"{device} has {size_text(free)} of free memory, and batch {batch} with heads {heads} needs about "
+            f"{size_text(need)}; "
             "lower --encoder.batch, or end what else runs there"
         )
     return free - need

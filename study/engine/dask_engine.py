@@ -47,7 +47,7 @@ CONFIGURATION = {
 
 
 class EngineLostError(BadInputError):
-    """The scheduler is gone; once there is one again, the same command resumes."""
+    """The scheduler is gone; with a new one, the same command resumes."""
 
 
 class DaskEngine:

@@ -72,21 +72,20 @@ class CellResult:
             head, parts, curves = read_product(folder, HEAD, ARRAYS)
         except BadInputError as error:
             raise BadInputError(f"{error}; run the cell again") from error
-        if head.get("format_version") != FORMAT_VERSION:
-            raise BadInputError(
-                f"{folder}: format {head.get('format_version')}; this program reads {FORMAT_VERSION}; run the cell again"
-            )
+        version = head.get("format_version")
+        if version != FORMAT_VERSION:
+            raise BadInputError(f"{folder}: format {version}; this program reads {FORMAT_VERSION}; run the cell again")
         try:
             cell, settings, facts = Cell.model_validate(head["cell"]), head["settings"], head["facts"]
             return CellResult(cell, str(head["key"]), settings, curves, **parts, facts=facts)
         except (ValueError, KeyError) as error:
-            raise BadInputError(f"{folder} is not a whole cell result: {error}; run the cell again") from error
+            raise BadInputError(f"{folder} is no complete cell result: {error}; run the cell again") from error
 
 
 def load_results(folder: Path) -> Iterator[CellResult]:
     """Yield the checked results below `folder`, each in a folder named by its key.
 
-    Raises BadInputError when there are none, and for one that is not whole or not what its own settings make.
+    Raises BadInputError when there are none, and for one that is damaged or does not fit its own settings.
     """
     if not folder.is_dir():
         raise BadInputError(f"{folder} is no folder; name the one that 'python -m study.sweep train' wrote with --out")

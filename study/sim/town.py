@@ -250,16 +250,16 @@ class _Draft:
             names = [self.strips[entry].index[1]]
             names += [f"{node}.{len(self.movements)}.{k}" for k in range(1, len(way.pieces))]
             names.append(self.strips[exit_].index[0])
-            own = []
+            strips = []
             for piece, ends in zip(way.pieces, pairwise(names), strict=True):
                 index = (*ends, taken.get(ends, 0))
                 taken[ends] = index[2] + 1
-                own.append(len(self.strips))
+                strips.append(len(self.strips))
                 self.strips.append(
                     Strip(piece.moved(x, y), index, left, right, junction=not bend, limit=self.limits[node][way.to_arm])
                 )
             length = sum(piece.length for piece in way.pieces)
-            self.movements.append(Movement(node, way.arm, way.turn, entry, exit_, tuple(own), length))
+            self.movements.append(Movement(node, way.arm, way.turn, entry, exit_, tuple(strips), length))
         self.phases.append(0 if bend else 2)
         if not bend:
             self._add_signals(node, arms)

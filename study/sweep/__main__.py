@@ -19,7 +19,7 @@ from study.config.paper import parameter_counts
 from study.console.interrupts import stoppable
 from study.console.options import Parser, run, typed
 from study.errors import BadInputError
-from study.stages import Cost, cell_cost, clock, size, total
+from study.stages import Cost, cell_cost, duration_text, size_text, total
 from study.sweep.options import add_plan_options, add_run_options, check_run_options
 from study.sweep.plan import Plan, given_plan, look_up
 
@@ -122,15 +122,15 @@ def dry_run(plan: Plan, tracking: str, *, as_json: bool) -> int:
     print(f"{plan.grid.name} ({plan.profile}): {plan.grid.title}\n")
     for key, cell in plan.cells.items():
         own = cell_cost(plan.settings, cell, plan.grid.policy_seeds)
-        state = "finished" if key in done else f"waiting, about {clock(own.seconds)}"
+        state = "finished" if key in done else f"waiting, about {duration_text(own.seconds)}"
         print(f"  {cell.label:<22} {key}  {plan.grid.policy_seeds} policies  {state}")
     counts = parameter_counts()
     heads = ", ".join(f"{head} head {counts[head]:,}" for head in HEADS)
-    where = "there already" if ready else f"about {clock(data.seconds)} to make"
+    where = "there already" if ready else f"about {duration_text(data.seconds)} to make"
     print(f"\nparameters  encoder {counts['encoder']:,}, {heads}")
     print(f"frames      {frames.encoder:,} for encoders, {frames.policy:,} for policies; {where}")
-    print(f"disk        about {size(whole.bytes)}")
-    print(f"time        about {clock(whole.seconds)} on 2 CPU cores")
+    print(f"disk        about {size_text(whole.bytes)}")
+    print(f"time        about {duration_text(whole.seconds)} on 2 CPU cores")
     return 0
 
 

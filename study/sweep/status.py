@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Literal
 from study.console.display import show_table
 from study.console.options import Parser, add_tracking_option
 from study.errors import masked
-from study.stages import CELL_STAGES, RESULT_S, STAGES, Work, cell_cost, clock, share_done
+from study.stages import CELL_STAGES, RESULT_S, STAGES, Work, cell_cost, duration_text, share_done
 from study.sweep.options import add_plan_options
 from study.sweep.plan import Plan, given_plan, look_up
 
@@ -183,7 +183,7 @@ def _show(plan: Plan, cells: Sequence[CellStatus], left: float, now: float, *, f
     parts = [f"{counts[state]} {state}" for state in STATES if state != "finished" and counts[state]]
     parts = [f"{plan.grid.name} ({plan.profile}): {counts['finished']} of {len(cells)} cells finished", *parts]
     if left:
-        parts.append(f"about {clock(left)} left")
+        parts.append(f"about {duration_text(left)} left")
     print(", ".join(parts))
     if not frames_ready and counts["finished"] < len(cells):
         print("frames are not made yet")
@@ -194,15 +194,15 @@ def _row(cell: CellStatus, now: float) -> tuple[str, str, str, str, str]:
     """Label, state, how far, since when, where."""
     how, since, where = "", "", ""
     if cell.state == "finished" and cell.took is not None:
-        how = f"in {clock(cell.took)}"
+        how = f"in {duration_text(cell.took)}"
     elif cell.state == "failed":
         how = cell.reason
     elif cell.since is not None:
         how = STAGES[cell.stage].activity if cell.stage in STAGES else "starting"
         how += f", epoch {cell.epoch} of {cell.epochs}" if cell.epochs else ""
         if cell.state != "running":
-            how += f"; no sign of life for {clock(cell.quiet)}"
-        since = f"since {time.strftime('%H:%M', time.localtime(cell.since))} ({clock(now - cell.since)})"
+            how += f"; no sign of life for {duration_text(cell.quiet)}"
+        since = f"since {time.strftime('%H:%M', time.localtime(cell.since))} ({duration_text(now - cell.since)})"
         where = f"{cell.host}, process {cell.process}" if cell.host else ""
         where += f", {cell.device}" if cell.device else ""
     elif cell.attempt:

@@ -100,10 +100,10 @@ def open_experiment(uri: str, name: str) -> Experiment:
     with guard(shown, opening=True), few_tries(BUSY):
         if client.get_experiment_by_name(name) is None:
             client.create_experiment(name, str(artifacts) if artifacts else None, {BESIDE: "true"})
-        found = client.get_experiment_by_name(name)
-        experiment = _usable(found, client, shown, artifacts)
-        for key, value in experiment_tags(experiment.id, found.tags).items():
-            if found.tags.get(key) != value:
+        entity = client.get_experiment_by_name(name)
+        experiment = _usable(entity, client, shown, artifacts)
+        for key, value in experiment_tags(experiment.id, entity.tags).items():
+            if entity.tags.get(key) != value:
                 client.set_experiment_tag(experiment.id, key, value)
     return experiment
 
@@ -115,8 +115,8 @@ def find_experiment(uri: str, name: str) -> Experiment | None:
         return None
     client, shown, artifacts = _connect(uri)
     with guard(shown, opening=True), few_tries():
-        found = client.get_experiment_by_name(name)
-        return _usable(found, client, shown, artifacts) if found else None
+        entity = client.get_experiment_by_name(name)
+        return _usable(entity, client, shown, artifacts) if entity else None
 
 
 def database_file(uri: str) -> Path | None:
@@ -177,20 +177,21 @@ def _connect(uri: str) -> tuple[MlflowClient, str, Path | None]:
         return MlflowClient(uri), shown, artifacts
 
 
-def _usable(found: MlflowExperiment, client: MlflowClient, shown: str, artifacts: Path | None) -> Experiment:
-    if found.lifecycle_stage != "active":
+def _usable(entity: MlflowExperiment, client: MlflowClient, shown: str, artifacts: Path | None) -> Experiment:
+    """Return the experiment. Raises BadInputError when it is deleted or its artifacts are elsewhere."""
+    if entity.lifecycle_stage != "active":
         raise BadInputError(
-            f"experiment '{found.name}' in {shown} is deleted; restore it: MLFLOW_TRACKING_URI={shown} "
-            f"mlflow experiments restore --experiment-id {found.experiment_id}"
+            f"experiment '{entity.name}' in {shown} is deleted; restore it: MLFLOW_TRACKING_URI={shown} "
+            f"mlflow experiments restore --experiment-id {entity.experiment_id}"
         )
     # MLflow stores absolute paths of artifacts and has no way to change them.
-    place = Path(found.artifact_location)
-    if shown.startswith(SQLITE) and artifacts and BESIDE in found.tags and place.resolve() != artifacts.resolve():
+    place = Path(entity.artifact_location)
+    if shown.startswith(SQLITE) and artifacts and BESIDE in entity.tags and place.resolve() != artifacts.resolve():
         raise BadInputError(
             f"{shown} was moved or copied: it expects its artifacts in {place}, not in {artifacts}; use it where it "
             f"was, or, if it was moved, link the old path to the new one: ln -s {artifacts} {place}"
         )
-    return Experiment(client, shown, str(found.experiment_id))
+    return Experiment(client, shown, str(entity.experiment_id))
 
 
 def _probe(uri: str, shown: str) -> None:

@@ -46,8 +46,8 @@ class Reader:
     @classmethod
     def look(cls, uri: str = DEFAULT_TRACKING, experiment: str = "study") -> Self | None:
         """Return a reader, or None where nothing was tracked yet, and create nothing."""
-        found = find_experiment(uri, experiment)
-        return cls(found) if found else None
+        opened = find_experiment(uri, experiment)
+        return cls(opened) if opened else None
 
     def finished(self, keys: Collection[str]) -> dict[str, str]:
         """Return key -> run id of the cells that are done; of several runs of one key, the first that was done."""
@@ -80,7 +80,7 @@ class Reader:
         return {key: reason_of(attempt.tags) for key, attempt in last.items() if PERMANENT in attempt.tags}
 
     def load_result(self, run_id: str) -> CellResult:
-        """Return the result that a finished cell run holds. Raises BadInputError when it is not whole."""
+        """Return the result that a finished cell run holds. Raises BadInputError when it is damaged."""
         with self.experiment.guard(), tempfile.TemporaryDirectory() as folder:
             key = self.experiment.client.get_run(run_id).data.tags.get("cell_key")
             try:
