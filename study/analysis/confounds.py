@@ -86,13 +86,13 @@ class Contrast:
 
 
 def concerned(record: SweepRecord) -> list[Confound]:
-    """The confounds that this kind of sweep has."""
+    """Return the confounds that this kind of sweep has."""
     several = len(record.grid.fractions) > 1
     return [confound for confound in CONFOUNDS if confound.fractions == several]
 
 
 def varied(one: StudySettings, other: StudySettings) -> Confound | None:
-    """The confound that two settings differ in, where they differ in nothing else."""
+    """Return the confound that two settings differ in, where they differ in nothing else."""
     here, there = (
         {f"{group}.{name}": value for group, part in settings for name, value in part} for settings in (one, other)
     )
@@ -102,13 +102,13 @@ def varied(one: StudySettings, other: StudySettings) -> Confound | None:
 
 
 def value(settings: StudySettings, setting: str) -> str:
-    """A setting's value as a word."""
+    """Return a setting's value as a word."""
     group, _, name = setting.partition(".")
     return str(getattr(getattr(settings, group), name))
 
 
 def contrasts(record: SweepRecord, other: SweepRecord, confound: Confound) -> list[Contrast]:
-    """Every head set against the baseline, at each fraction, that both sweeps have finished."""
+    """Return every head set against the baseline, at each fraction, that both sweeps have finished."""
     panels = [learning_curves.panel(each.table(), learning_curves.ACCURACY) for each in (record, other)]
     rows = []
     for pair in effects.planned(record.grid):

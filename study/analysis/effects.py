@@ -45,7 +45,6 @@ class Contrast:
     p_holm: Number
     improvement: Number
     detectable: Number
-    hierarchical: Interval | None
     episodes: Interval | None
 
 
@@ -112,7 +111,6 @@ def compare(record: SweepRecord, metric: str, curves: Panel) -> list[Contrast]:
             p_holm,
             comparisons.improvement(scores[first].to_numpy(), scores[second].to_numpy()),
             comparisons.detectable(learning_curves.by_encoder(values)),
-            intervals.hierarchical(values) if learning_curves.encoders(values) > 1 else None,
             _episodes(record, first, second) if metric == ACCURACY else None,
         )
         for ((first, second), values), p, p_holm in zip(differences.items(), p_values, adjusted, strict=False)

@@ -115,25 +115,6 @@ def mean_interval(values: pd.Series, level: float = LEVEL) -> Estimate:
     return bootstrap(units, level) if encoders(values) == 1 else t_interval(units, "t, over encoder seeds", level)
 
 
-def hierarchical(values: pd.Series, level: float = LEVEL) -> Estimate:
-    """Return the mean with its percentile interval when encoders, and then the policies on each, are drawn anew.
-
-    With 5 encoders of 3 policies it covers the mean 81 times in a hundred where all the spread is between encoders, 91
-    where both levels spread alike, and 97 where none is (15 encoders of one policy: 93). Student's t over the encoders'
-    means covers 95 in each of these, so verdicts use that.
-    """
-    rows = [group.to_numpy(np.float64) for _, group in values.groupby(level="encoder_seed")]
-    rng = generator("hierarchical")
-    means = np.empty((DRAWS, len(rows)))
-    chosen = rng.integers(len(rows), size=means.shape)
-    for index, row in enumerate(rows):
-        where = chosen == index
-        means[where] = row[rng.integers(len(row), size=(int(where.sum()), len(row)))].mean(axis=1)
-    low, high = np.quantile(means.mean(axis=1), [(1 - level) / 2, (1 + level) / 2])
-    kind = "hierarchical bootstrap, over encoder and policy seeds"
-    return Estimate(float(values.mean()), float(low), float(high), len(rows), kind, level)
-
-
 def variance_components(curves: pd.DataFrame, last: int = LAST) -> dict[str, float]:
     """Return the standard deviations due to encoder seed, policy seed and epoch, by nested analysis of variance.
 

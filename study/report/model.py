@@ -71,9 +71,13 @@ class Spread(Part):
 
 
 class Score(Part):
-    """Final scores of a cell by name of the metric; `share` is the gain's part of the possible gain below a ceiling.
+    """What is known of a finished cell.
 
-    `confusion`: the share of each true class (row) that is given each class, after the last epoch.
+    `metrics`: final scores by name of the metric; `gain`: accuracy above the floor; `share`: its part of the possible
+    gain below a ceiling; `confusion`: the share of each true class (row) that is given each class after the last epoch;
+    `components`: standard deviations of accuracy between encoders, policies and epochs; `losses`: those of each head on
+    each split after the last epoch, mean over encoders; `probes`: the share of each quantity's variance that a linear
+    model reads off the latents, mean over encoders.
     """
 
     cell: str
@@ -85,7 +89,9 @@ class Score(Part):
     gain: Number
     share: Number = math.nan
     confusion: tuple[tuple[Number, ...], ...]
-    classes: tuple[float, ...]
+    components: dict[str, Number]
+    losses: dict[str, dict[str, Number]]
+    probes: dict[str, Number]
 
     @property
     def point(self) -> Point:
@@ -127,35 +133,6 @@ class Confound(Part):
     def flipped(self) -> list[str]:
         """Return the names of the contrasts whose sign differs between the two values."""
         return [row.name for row in self.contrasts if row.here.value * row.there.value < 0]
-
-
-class Components(Part):
-    """Standard deviations of accuracy between encoders, between policies and between epochs."""
-
-    cell: str
-    encoder: Number
-    policy: Number
-    epoch: Number
-
-
-class EncoderLosses(Part):
-    """Losses of an encoder's heads on each split after the last epoch, mean over encoder seeds."""
-
-    cell: str
-    encoders: int
-    losses: dict[str, dict[str, Number]]
-
-
-class Probe(Part):
-    """Share of each quantity's variance that a linear model reads off the latents, mean over encoders."""
-
-    cell: str
-    encoders: int
-    speed: Number
-    stop: Number
-    gap: Number
-    steering: Number
-    brake: Number
 
 
 class Setting(Part):
@@ -229,9 +206,6 @@ class Report(Part):
     planned_contrasts: int
     convergence: tuple[Convergence, ...]
     confounds: tuple[Confound, ...] = ()
-    components: tuple[Components, ...]
-    encoders: tuple[EncoderLosses, ...]
-    probes: tuple[Probe, ...] = ()
     claims: tuple[Verdict, ...]
     rules: dict[str, float]
     settings: tuple[Setting, ...]

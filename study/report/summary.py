@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Literal
 
 import numpy as np
@@ -15,17 +15,15 @@ from study.analysis import claims, confounds, convergence, effects, intervals, l
 from study.analysis.learning_curves import ACCURACY, STEERING, Point
 from study.analysis.metrics import METRICS
 from study.config.heads import HEADS
-from study.config.paper import ACCELERATIONS, parameter_counts
+from study.config.paper import parameter_counts
+from study.products import Arrays
 from study.report.model import (
     CellCost,
-    Components,
     Confound,
     Convergence,
     Cost,
     Data,
-    EncoderLosses,
     Failure,
-    Probe,
     Provenance,
     Report,
     Score,
@@ -46,8 +44,7 @@ def summarise(record: SweepRecord) -> Report:
     """Return the report of a sweep, over its finished cells."""
     grid, table = record.grid, record.table()
     accuracy = learning_curves.panel(table, ACCURACY)
-    cells = {point: effects.label(point, grid) for point in effects.points(grid)}
-    finished = {point: cell for point, cell in cells.items() if point in accuracy}
+    finished = {point: accuracy[point] for point in effects.points(grid) if point in accuracy}
     base = accuracy.get((grid.baseline, max(grid.fractions)))
     floor, ceiling = _floor(record), _ceiling(record)
     contrasts = (effects.compare(record, name, learning_curves.panel(table, name)) for name in (ACCURACY, STEERING))
@@ -56,18 +53,15 @@ def summarise(record: SweepRecord) -> Report:
         metrics=tuple(METRICS.values()),
         floor=floor,
         ceiling=ceiling,
-        scores=tuple(_score(record, point, cell, floor[ACCURACY], ceiling) for point, cell in finished.items()),
+        scores=tuple(_score(record, point, curves, floor[ACCURACY], ceiling) for point, curves in finished.items()),
         comparisons=tuple(itertools.chain.from_iterable(contrasts)),
         planned_contrasts=len(effects.planned(grid)),
         convergence=tuple(
-            _convergence(point, cell, accuracy[point], base) for point, cell in finished.items() if base is not None
+            _convergence(point, effects.label(point, grid), curves, base)
+            for point, curves in finished.items()
+            if base is not None
         ),
         confounds=tuple(_confounds(record)),
-        components=tuple(
-            Components(cell=cell, **intervals.variance_components(accuracy[point])) for point, cell in finished.items()
-        ),
-        encoders=tuple(_encoders(table, cells)),
-        probes=tuple(_probes(record, cells)),
         claims=tuple(
             verdict
             for verdict in claims.judge(record)
@@ -87,16 +81,12 @@ def _sweep(record: SweepRecord, design: Literal["A", "B"]) -> Sweep:
     missing = {key: cell.label for key, cell in record.planned.items() if key not in record.results}
     reasons = {key: record.failed[key].strip() for key in missing if key in record.failed}
     return Sweep(
-        name=grid.name,
-        title=grid.title,
+        **grid.model_dump(include={"name", "title", "encoder_seeds", "policy_seeds", "baseline"}),
         simulator=f"imported drives, written by {', '.join(writers)}" if writers else SIMULATOR,
         imported=bool(writers),
         profile=record.profile,
         design=design,
-        encoder_seeds=grid.encoder_seeds,
-        policy_seeds=grid.policy_seeds,
         policy_epochs=record.settings.policy.epochs,
-        baseline=grid.baseline,
         heads=tuple(effects.ordered(grid.heads)),
         fractions=tuple(sorted(grid.fractions, reverse=True)),
         planned=len(record.planned),
@@ -137,7 +127,7 @@ def _spread(scores: pd.Series) -> Spread:
     )
 
 
-def _score(record: SweepRecord, point: Point, cell: str, floor: float, ceiling: Spread | None) -> Score:
+def _score(record: SweepRecord, point: Point, curves: pd.DataFrame, floor: float, ceiling: Spread | None) -> Score:
     results = effects.results_at(record, point)
     recall = [
         predictions.confusion(result.predictions["acceleration"], result.predictions["acceleration_label"])
@@ -146,7 +136,7 @@ def _score(record: SweepRecord, point: Point, cell: str, floor: float, ceiling: 
     scores = {name: metrics.scores(results, metric) for name, metric in METRICS.items()}
     gain = float(scores[ACCURACY].mean()) - floor
     return Score(
-        cell=cell,
+        cell=effects.label(point, record.grid),
         heads=point[0],
         fraction=point[1],
         encoders=len(results),
@@ -155,7 +145,9 @@ def _score(record: SweepRecord, point: Point, cell: str, floor: float, ceiling: 
         gain=gain,
         share=gain / (ceiling.mean - floor) if ceiling and ceiling.mean > floor else math.nan,
         confusion=np.concatenate(recall).mean(axis=0).tolist(),
-        classes=ACCELERATIONS,
+        components=intervals.variance_components(curves),
+        losses=_losses(results),
+        probes=_probes(results),
     )
 
 
@@ -190,43 +182,39 @@ def _confounds(record: SweepRecord) -> Iterator[Confound]:
         )
 
 
-def _encoders(table: pd.DataFrame, cells: Mapping[Point, str]) -> Iterator[EncoderLosses]:
-    rows = table[table["stage"] == "encoder"]
-    for (heads, fraction), cell in cells.items():
-        own = rows[(rows["heads"] == heads) & (rows["fraction"] == fraction)]
-        if own.empty:
-            continue
-        last = own[own["epoch"] == own["epoch"].max()].groupby(["metric", "split"])["value"].mean()
-        names = {name.removeprefix("loss_") for name, _ in last.index if name.startswith("loss_")} - {"kl"}
-        losses = {
-            head: {split: last.get((f"loss_{head}", split), math.nan) for split in ("train", "test")}
-            for head in sorted(names, key=[*HEADS, *sorted(names)].index)
-        }
-        yield EncoderLosses(cell=cell, encoders=own["encoder_seed"].nunique(), losses=losses)
-
-
-def _probes(record: SweepRecord, cells: Mapping[Point, str]) -> Iterator[Probe]:
-    for point, cell in cells.items():
-        probes = [_probe(result) for result in effects.results_at(record, point)]
-        if probes and all(probes):
-            means = {name: float(np.mean([probe[name] for probe in probes])) for name in probes[0]}
-            yield Probe(cell=cell, encoders=len(probes), **means)
-
-
-def _probe(result: CellResult) -> dict[str, float]:
-    """Return R2 of each probed quantity; nothing for a result of a version that did not keep them."""
-    own = result.predictions
-    if not {"speed", "light", "lead_gap"} <= set(own):
-        return {}
-    gap = own["lead_gap"].astype(np.float64)
-    targets = {
-        "speed": own["speed"],
-        "stop": own["light"] > 0,
-        "gap": np.where(gap <= NEAR, gap, np.nan),
-        "steering": own["steering_label"],
-        "brake": own["acceleration_label"] == 0,
+def _losses(results: list[CellResult]) -> dict[str, dict[str, float]]:
+    """Return the loss of each head on each split after the last epoch, mean over encoders."""
+    curves = pd.concat([result.curves for result in results])
+    rows = curves[(curves["stage"] == "encoder") & curves["metric"].str.startswith("loss_")]
+    last = rows[rows["epoch"] == rows["epoch"].max()].groupby(["metric", "split"])["value"].mean()
+    heads = sorted({name.removeprefix("loss_") for name, _ in last.index} - {"kl"})
+    return {
+        head: {split: float(last.get((f"loss_{head}", split), math.nan)) for split in ("train", "test")}
+        for head in sorted(heads, key=[*HEADS, *heads].index)
     }
-    return {name: predictions.probe(own["z"], np.asarray(v, np.float64), own["episode"]) for name, v in targets.items()}
+
+
+def _probes(results: list[CellResult]) -> dict[str, float]:
+    """Return R2 of each probed quantity, mean over encoders; nothing for results of a version that kept too little."""
+    if not all({"speed", "light", "lead_gap"} <= set(result.predictions) for result in results):
+        return {}
+    probes = pd.DataFrame([_probe(result.predictions) for result in results])
+    return {str(name): float(mean) for name, mean in probes.mean(skipna=False).items()}
+
+
+def _probe(arrays: Arrays) -> dict[str, float]:
+    gap = arrays["lead_gap"].astype(np.float64)
+    targets = {
+        "speed": arrays["speed"],
+        "stop": arrays["light"] > 0,
+        "gap": np.where(gap <= NEAR, gap, np.nan),
+        "steering": arrays["steering_label"],
+        "brake": arrays["acceleration_label"] == 0,
+    }
+    return {
+        name: predictions.probe(arrays["z"], np.asarray(target, np.float64), arrays["episode"])
+        for name, target in targets.items()
+    }
 
 
 def _settings(record: SweepRecord) -> Iterator[Setting]:
