@@ -11,6 +11,7 @@ import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from study.atomic import write_atomic
 from study.config.heads import HEAD_SETS, HeadSet
 
 BLUE, VERMILION = "#0072B2", "#D55E00"
@@ -58,7 +59,6 @@ def look(name: str) -> HeadSet:
 
 def save(figure: Figure, folder: Path, name: str) -> tuple[Path, Path]:
     """Write a figure as `name.svg` and `name.png`."""
-    folder.mkdir(parents=True, exist_ok=True)
     paths = folder / f"{name}.svg", folder / f"{name}.png"
     for path in paths:
         write(figure, path)
@@ -70,9 +70,7 @@ def write(figure: Figure, path: Path) -> None:
     kind, stream = path.suffix[1:].lower(), io.BytesIO()
     with mpl.rc_context(STYLE):
         figure.savefig(stream, format=kind, dpi=200, metadata=METADATA[kind])
-    draft = path.with_name(f".{path.name}")
-    draft.write_bytes(stream.getvalue())
-    draft.replace(path)
+    write_atomic(path, stream.getvalue())
 
 
 def new_figure(height: float, columns: int = 1, rows: int = 1) -> tuple[Figure, list[Axes]]:

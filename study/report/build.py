@@ -10,6 +10,7 @@ from pathlib import Path
 
 import typst
 
+from study.atomic import write_atomic
 from study.config.workspace import REPORTS
 from study.errors import BadInputError, masked
 from study.figures.style import METADATA, save, write
@@ -39,15 +40,13 @@ def build_report(record: SweepRecord, folder: Path = REPORTS) -> Path:
     for file in (files / "figures").glob("*"):
         if file not in written:  # of an earlier report with other cells
             file.unlink()
-    _write(files / "report.json", report.json())
-    draft = files / ".curves.parquet"
-    record.table(ceiling=True).to_parquet(draft, index=False)
-    draft.replace(files / "curves.parquet")
+    write_atomic(files / "report.json", report.json())
+    write_atomic(files / "curves.parquet", record.table(ceiling=True).to_parquet(index=False))
     pictures = {f"figures/{file.name}": file.read_bytes() for file in written if file.suffix == ".svg"}
     pdf = folder / f"{record.grid.name}.pdf"
     sweep = report.sweep
     title, footer = f"{sweep.title} ({sweep.name}, {sweep.profile})", f"{sweep.name} ({sweep.profile})"
-    _write(pdf, typeset(title, footer, document(report), pictures))
+    write_atomic(pdf, typeset(title, footer, document(report), pictures))
     return pdf
 
 
@@ -59,13 +58,6 @@ def typeset(title: str, footer: str, blocks: Sequence[Block], pictures: dict[str
     # Its type stub does not know of files by name, which its documentation has.
     pdf: bytes = typst.compile(files, format="pdf", ignore_system_fonts=True)  # type: ignore[call-overload]
     return pdf
-
-
-def _write(path: Path, content: bytes) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f".{path.name}")
-    draft.write_bytes(content)
-    draft.replace(path)
 
 
 def publish(tracker: Tracker, name: str, profile: str | None, folder: Path) -> Path:
