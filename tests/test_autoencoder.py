@@ -233,7 +233,7 @@ def test_gradients_taken_head_by_head_are_those_of_the_total_loss(frames: Frames
     pixels, targets = images.permute(0, 3, 1, 2) / 255, unpack(masks, mask_places(["pred", "plan"]))
     features = reference.encoder.features(pixels)
     mean, log_variance = reference.encoder.mean(features), reference.encoder.log_variance(features)
-    noise = networks.seeded_generator(0, "noise")
+    noise = networks.seeded_generator(0, "encoder noise")
     z = mean + (log_variance / 2).exp() * torch.randn(mean.shape, generator=noise)
     normal = torch.distributions.Normal
     kl = torch.distributions.kl_divergence(normal(mean, (log_variance / 2).exp()), normal(0.0, 1.0))

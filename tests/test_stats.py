@@ -10,6 +10,7 @@ from scipy import stats as scipy_stats
 from sklearn import linear_model, preprocessing
 from statsmodels.stats.weightstats import DescrStatsW
 
+from study import randomness
 from study.analysis import comparisons, convergence, intervals, learning_curves, predictions
 from study.results.cell_result import TABLE_COLUMNS
 from study.tracking.metrics import final_scores
@@ -322,7 +323,7 @@ def test_a_probe_is_scikit_learns_ridge_on_held_out_drives():
     target = z[:, 0] + rng.normal(size=300)
     x = preprocessing.StandardScaler().fit_transform(z.astype(float))
     error = total = 0.0
-    for held in np.array_split(intervals.generator("probe").permutation(10), 5):
+    for held in np.array_split(randomness.rng(0, "probe").permutation(10), 5):
         test = np.isin(drive, held)
         fit = linear_model.Ridge(alpha=1.0).fit(x[~test], target[~test])
         error += ((target[test] - fit.predict(x[test])) ** 2).sum()

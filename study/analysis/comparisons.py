@@ -11,8 +11,9 @@ from scipy import optimize, special
 from scipy import stats as scipy_stats
 from statsmodels.stats.weightstats import DescrStatsW
 
-from study.analysis.intervals import DRAWS, LEVEL, Estimate, generator, t_interval
+from study.analysis.intervals import DRAWS, LEVEL, Estimate, t_interval
 from study.analysis.learning_curves import Array
+from study.randomness import rng
 
 WELCH = "Welch's t, two samples"
 EXACT = 20  # pairs up to which every flip of signs is counted
@@ -38,7 +39,7 @@ def sign_flip(differences: Array) -> float:
         for value in differences:
             sums = np.concatenate([sums + value, sums - value])
         return float(np.mean(np.abs(sums) >= observed))
-    signs = generator("sign flip").choice([-1.0, 1.0], size=(DRAWS, n))
+    signs = rng(0, "sign flip").choice([-1.0, 1.0], size=(DRAWS, n))
     return float((1 + np.sum(np.abs(signs @ differences) >= observed)) / (1 + DRAWS))
 
 

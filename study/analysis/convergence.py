@@ -9,8 +9,9 @@ import numpy as np
 import pandas as pd
 from scipy import stats as scipy_stats
 
-from study.analysis.intervals import DRAWS, LEVEL, Estimate, generator, t_limits
+from study.analysis.intervals import DRAWS, LEVEL, Estimate, t_limits
 from study.analysis.learning_curves import LAST, Array, by_seed, encoders, final
+from study.randomness import rng
 
 
 def first_reach(curve: Array, target: float) -> Array:
@@ -28,25 +29,25 @@ def epochs_to_reach(curves: pd.DataFrame, baseline: pd.DataFrame, last: int = LA
     value = float(first_reach(curves.mean().to_numpy(), float(final(baseline, last).mean())))
     if len(curves) < 2:
         return Estimate(value, math.nan, math.nan, len(curves), "no interval from one seed")
-    rng = generator("epochs to reach")
+    generator = rng(0, "epochs to reach")
     shared = curves.index.equals(baseline.index)
-    weights = _resampled(curves, rng)
-    others = weights if shared else _resampled(baseline, rng)
+    weights = _resampled(curves, generator)
+    others = weights if shared else _resampled(baseline, generator)
     reached = first_reach(weights @ curves.to_numpy(), others @ final(baseline, last).to_numpy())
     low, high = np.quantile(reached, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], method="closest_observation")
     kind = "percentile bootstrap of the mean curve, over seeds"
     return Estimate(value, float(low), float(high), len(by_seed(curves)), kind)
 
 
-def _resampled(curves: pd.DataFrame, rng: np.random.Generator) -> Array:
+def _resampled(curves: pd.DataFrame, generator: np.random.Generator) -> Array:
     """Weights [draws, seeds] of a mean over resampled encoders and policies."""
     encoder = pd.factorize(curves.index.get_level_values("encoder_seed"))[0]
     count, draws = int(encoder.max()) + 1, DRAWS // 5
     weights = np.zeros((draws, len(curves)))
-    times = rng.multinomial(count, np.full(count, 1 / count), size=draws) if count > 1 else np.ones((draws, 1))
+    times = generator.multinomial(count, np.full(count, 1 / count), size=draws) if count > 1 else np.ones((draws, 1))
     for index in range(count):
         members = np.flatnonzero(encoder == index)
-        share = rng.multinomial(len(members), np.full(len(members), 1 / len(members)), size=draws) / len(members)
+        share = generator.multinomial(len(members), np.full(len(members), 1 / len(members)), size=draws) / len(members)
         weights[:, members] = share * times[:, [index]] / count
     return weights
 

@@ -18,6 +18,7 @@ from scipy import stats as scipy_stats
 from statsmodels.stats.weightstats import DescrStatsW
 
 from study.analysis.learning_curves import LAST, Array, by_encoder, encoders, panel
+from study.randomness import rng
 
 LEVEL = 0.95
 DRAWS = 10_000  # bootstrap resamples
@@ -37,11 +38,6 @@ class Estimate:
     n: int
     kind: str
     level: float = LEVEL
-
-
-def generator(purpose: str) -> np.random.Generator:
-    """Return the random numbers of one purpose: the same table gives the same intervals."""
-    return np.random.default_rng(list(purpose.encode()))
 
 
 def curve_bands(table: pd.DataFrame, metric: str, split: str = "test", stage: str = "policy") -> pd.DataFrame:
@@ -96,7 +92,7 @@ def bootstrap(values: Array, level: float = LEVEL) -> Estimate:
     if np.ptp(values) == 0:
         return Estimate(mean, mean, mean, n, BCA, level)
     low, high = scipy_stats.bootstrap(
-        (values,), np.mean, n_resamples=DRAWS, confidence_level=expanded(n, level), rng=generator("bootstrap")
+        (values,), np.mean, n_resamples=DRAWS, confidence_level=expanded(n, level), rng=rng(0, "bootstrap")
     ).confidence_interval
     return Estimate(mean, float(low), float(high), n, BCA, level)
 

@@ -15,9 +15,9 @@ from sklearn.linear_model import Ridge
 from sklearn.model_selection import cross_val_predict
 from sklearn.preprocessing import StandardScaler
 
-from study.analysis.intervals import generator
 from study.analysis.learning_curves import Array
 from study.config.paper import ACCELERATIONS
+from study.randomness import rng
 
 CLASSES = range(len(ACCELERATIONS))
 
@@ -57,7 +57,7 @@ def probe(z: NDArray[np.float32], target: Array, drive: NDArray[np.int32], folds
     if len(names) < folds or np.ptp(y) == 0:
         return math.nan
     x = StandardScaler().fit_transform(z[known].astype(np.float64))
-    tests = [np.isin(group, held) for held in np.array_split(generator("probe").permutation(names), folds)]
+    tests = [np.isin(group, held) for held in np.array_split(rng(0, "probe").permutation(names), folds)]
     splits = [(np.flatnonzero(~test), np.flatnonzero(test)) for test in tests]
     guess, mean = (cross_val_predict(model, x, y, cv=splits) for model in (Ridge(), DummyRegressor()))
     return float(1 - ((y - guess) ** 2).sum() / ((y - mean) ** 2).sum())

@@ -22,6 +22,7 @@ from study.config.paper import ACCELERATIONS, IMAGE
 from study.data.frames import Frames, FrameStore
 from study.data.selection import SETS
 from study.episode.head import episode_digest
+from study.randomness import rng
 
 FILES = ("card.json", "card.txt", "card.png")
 VIEW_DRIVES, VIEW_FRAMES = 8, 1000  # of each set, in which the agents in view are counted
@@ -32,8 +33,6 @@ DISTANCES = tuple(range(31))  # [grey levels], where the distribution of the dis
 QUANTILES = (0.05, 0.25, 0.5, 0.75)
 MEMORY = 32  # [MiB] of distances at once
 CHUNK = 500  # images read at once: 6 MB
-
-_VIEW, _POOL, _FRAME, _DRIVE = 0, 1, 2, 3  # what a random generator is for
 
 Grey = NDArray[np.uint8]
 
@@ -124,14 +123,14 @@ def _agents_in_view(
     frames: Frames, sources: Sequence[Path | None], birdview: dict[str, Any], number: int
 ) -> dict[str, Any]:
     """Count the other vehicles whose centres lie in the field of view, in frames of a few random drives."""
-    rng = np.random.default_rng([_VIEW, number])
+    generator = rng(0, f"card agents in view {number}")
     episode = frames.labels["episode"].to_numpy()
     here = [drive for drive in np.unique(episode).tolist() if sources[drive] is not None]
-    drawn = np.sort(rng.permutation(here)[:VIEW_DRIVES]).tolist()
+    drawn = np.sort(generator.permutation(here)[:VIEW_DRIVES]).tolist()
     counts: list[int] = []
     for drive in drawn:
         rows = np.flatnonzero(episode == drive)
-        rows = np.sort(rng.permutation(rows)[: VIEW_FRAMES // len(drawn)])
+        rows = np.sort(generator.permutation(rows)[: VIEW_FRAMES // len(drawn)])
         counts += _others(frames.labels.iloc[rows], Path(str(sources[drive])), birdview)
     return {"frames": len(counts), "drives": len(drawn), "counts": np.bincount(counts).tolist() if counts else []}
 
@@ -161,29 +160,29 @@ def _twins(frames: Frames, test_share: float, number: int) -> dict[str, Any]:
     frames are then split both ways, into parts of about the same size. Frames of a single drive can only be split one
     by one: then there is no entry `episode`.
     """
-    rng = np.random.default_rng([_POOL, number])
+    generator = rng(0, f"card drives {number}")
     episode = frames.labels["episode"].to_numpy()
     drives, sizes = np.unique(episode, return_counts=True)
-    order = rng.permutation(len(drives))
+    order = generator.permutation(len(drives))
     count = max(2, int(np.searchsorted(np.cumsum(sizes[order]), POOL, side="right")))
     drawn = np.sort(drives[order[:count]])
     rows = np.flatnonzero(np.isin(episode, drawn))
     if len(rows) > POOL:  # two drives with more frames than that
-        rows = np.sort(rng.permutation(rows)[:POOL])
+        rows = np.sort(generator.permutation(rows)[:POOL])
     pictures, drive = thumbnails(frames.images, rows), episode[rows]
 
-    rng = np.random.default_rng([_DRIVE, number])
-    held = rng.permutation(drawn)[: min(max(1, round(len(drawn) * test_share)), len(drawn) - 1)]
+    generator = rng(0, f"card test drives {number}")
+    held = generator.permutation(drawn)[: min(max(1, round(len(drawn) * test_share)), len(drawn) - 1)]
     by_drive = np.isin(drive, held)
     by_frame = np.zeros(len(rows), bool)
     tests = int(by_drive.sum()) or max(1, round(len(rows) * test_share))
-    by_frame[np.random.default_rng([_FRAME, number]).permutation(len(rows))[:tests]] = True
+    by_frame[rng(0, f"card test frames {number}").permutation(len(rows))[:tests]] = True
     distances: dict[str, Any] = {"frames": len(rows), "drives": len(drawn)}
     for name, test in (("episode", by_drive), ("frame", by_frame)):
         if not test.any():
             continue
         asked = np.flatnonzero(test)
-        asked = np.sort(rng.permutation(asked)[:QUERIES])
+        asked = np.sort(generator.permutation(asked)[:QUERIES])
         distance, nearest = nearest_frames(pictures[asked], pictures[~test])
         same = drive[~test][nearest] == drive[asked]
         distances[name] = {

@@ -28,12 +28,10 @@ from study.data.birdview import MASK_BYTES
 from study.data.selection import LABELS, SETS, Indices
 from study.episode.head import file_digest
 from study.errors import BadInputError
+from study.randomness import rng
 
 SCHEMA_VERSION = 1
 PARTS = "parts"  # folder of the notes on what is painted
-
-# What a random generator is for; with a seed it makes the generator. `selection` has others.
-_SUBSET, _ORDER = 2, 3
 
 Bytes = NDArray[np.uint8]
 
@@ -71,12 +69,12 @@ class Frames:
         if not 0 < fraction <= 1:
             raise BadInputError(f"data fraction {fraction}: it must be above 0 and at most 1")
         train = self.indices("train")
-        rng = np.random.default_rng([seed, _SUBSET])
+        generator = rng(seed, "data fraction")
         if unit == "frame":
-            part = rng.permutation(train)[: round(fraction * len(train))]
+            part = generator.permutation(train)[: round(fraction * len(train))]
         else:
             drives = self.labels["episode"].to_numpy()[train]
-            drawn = rng.permutation(np.unique(drives))
+            drawn = generator.permutation(np.unique(drives))
             part = train[np.isin(drives, drawn[: round(fraction * len(drawn))])]
         if not len(part):
             raise BadInputError(
@@ -107,7 +105,7 @@ def unpack_masks(masks: Bytes) -> Bytes:
 
 def epoch_order(indices: Indices, seed: int, epoch: int) -> Indices:
     """Return the rows in the random order of one epoch, which depends on nothing but seed and epoch."""
-    return np.random.default_rng([seed, _ORDER, epoch]).permutation(indices)
+    return rng(seed, f"encoder epoch {epoch}").permutation(indices)
 
 
 def open_frames(folder: Path, *, check: bool = False) -> FrameStore:

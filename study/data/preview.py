@@ -24,6 +24,7 @@ from study.episode.schema import Episode
 from study.errors import BadInputError
 from study.figures.pictures import contact_sheet
 from study.figures.style import write
+from study.randomness import rng
 
 FILES = ("contact.png", "drive.gif")
 SHOWN = 12  # frames of each set on the contact sheet
@@ -56,7 +57,7 @@ def write_preview(store: FrameStore, drives: Sequence[Path], folder: Path) -> tu
 
 def sample(frames: Frames, seed: int, count: int = SHOWN) -> list[tuple[str, NDArray[np.uint8]]]:
     """Return random training frames: label in words, and input and masks as [1 + K, 64, 64, 3] uint8."""
-    rows = np.sort(np.random.default_rng([seed]).permutation(frames.indices("train"))[:count])
+    rows = np.sort(rng(seed, "preview").permutation(frames.indices("train"))[:count])
     masks = np.repeat(unpack_masks(frames.masks[rows])[..., None] * np.uint8(255), 3, axis=4)
     pictures = np.concatenate([frames.images[rows][:, None], masks], axis=1)
     return [(label_text(frames, row), picture) for row, picture in zip(rows.tolist(), pictures, strict=True)]

@@ -19,6 +19,7 @@ from study.data.birdview import governing_light, valid_moments
 from study.episode.files import read_episode
 from study.episode.schema import RATE_HZ
 from study.errors import BadInputError
+from study.randomness import rng
 
 SETS = ("encoder", "policy")
 STEERING_EDGES = (-0.15, -0.05, -0.01, 0.01, 0.05, 0.15)  # of the bins that the policy set is raked to
@@ -38,9 +39,6 @@ LABELS: dict[str, type[np.generic]] = {
     "standing": np.bool_,
 }
 
-# What a random generator is for; with the settings' seed and the set it makes the generator.
-_CANDIDATES, _CHOICE = 0, 1
-
 Indices = NDArray[np.int64]
 Columns = dict[str, NDArray[Any]]
 
@@ -52,14 +50,14 @@ def candidates(path: Path, number: int, name: str, frames: FramesSettings, birdv
     moment is kept with probability `standing_weight`.
     """
     episode = read_episode(path)
-    rng = np.random.default_rng([frames.seed, _CANDIDATES, SETS.index(name), number])
+    generator = rng(frames.seed, f"candidates {name} {number}")
     every = max(1, int(np.ceil(frames.spacing * RATE_HZ - 1e-9)))
-    phase = rng.integers(every, size=len(episode.agents))
+    phase = generator.integers(every, size=len(episode.agents))
     moments = valid_moments(episode, birdview)
     moments = moments[(moments[:, 0] - phase[moments[:, 1]]) % every == 0]
     if name == "encoder":
         moving = episode.speed[tuple(moments.T)] >= STANDING
-        moments = moments[moving | (rng.random(len(moments)) < frames.standing_weight)]
+        moments = moments[moving | (generator.random(len(moments)) < frames.standing_weight)]
     at = tuple(moments.T)
     ids = np.array([agent.id for agent in episode.agents], int)
     columns = {
@@ -82,19 +80,19 @@ def choose(
     columns: Columns, name: str, wanted: int, drives: int, settings: FramesSettings
 ) -> tuple[Indices, NDArray[np.bool_], list[int]]:
     """Return the rows of the chosen candidates, sorted, whether each is for training, and the test drives (Sec. V)."""
-    rng = np.random.default_rng([settings.seed, _CHOICE, SETS.index(name)])
+    generator = rng(settings.seed, f"frames {name}")
     test = round(wanted * settings.test_share)
     balance = settings.balance if name == "policy" else "none"
     if settings.split == "frame":
-        rows = _sample(columns, np.arange(len(columns["step"])), wanted, balance, name, "", settings, rng)
+        rows = _sample(columns, np.arange(len(columns["step"])), wanted, balance, name, "", settings, generator)
         train = np.ones(wanted, bool)
-        train[rng.permutation(wanted)[:test]] = False
+        train[generator.permutation(wanted)[:test]] = False
         return rows, train, []
     count = min(max(1, round(drives * settings.test_share)), drives - 1)
-    test_drives = np.sort(rng.permutation(drives)[:count])
+    test_drives = np.sort(generator.permutation(drives)[:count])
     in_test = np.isin(columns["episode"], test_drives)
     parts = [
-        _sample(columns, np.flatnonzero(pool), number, balance, name, f" {split}", settings, rng)
+        _sample(columns, np.flatnonzero(pool), number, balance, name, f" {split}", settings, generator)
         for pool, number, split in ((~in_test, wanted - test, "training"), (in_test, test, "test"))
     ]
     rows = np.sort(np.concatenate(parts))
@@ -109,7 +107,7 @@ def _sample(
     name: str,
     split: str,
     settings: FramesSettings,
-    rng: np.random.Generator,
+    generator: np.random.Generator,
 ) -> Indices:
     """Draw `wanted` rows of the pool without replacement, sorted; raked to the targets unless `balance` is none."""
     if wanted > len(pool):
@@ -119,11 +117,11 @@ def _sample(
             "(import more drives, if they are yours)"
         )
     if balance == "none":
-        return np.sort(rng.permutation(pool)[:wanted])
+        return np.sort(generator.permutation(pool)[:wanted])
     cell, shape, margins = _cells(columns, pool, balance, settings)
     available = np.bincount(cell, minlength=int(np.prod(shape))).reshape(shape)
     counts = rake(available, margins, wanted, settings.weight_cap).reshape(-1)
-    order = np.lexsort((rng.random(len(pool)), cell))
+    order = np.lexsort((generator.random(len(pool)), cell))
     first = np.searchsorted(cell[order], np.arange(len(counts)))
     rank = np.arange(len(pool)) - first[cell[order]]
     return np.sort(pool[order[rank < counts[cell[order]]]])

@@ -43,9 +43,9 @@ class MultiHeadAutoencoder(lightning.LightningModule):
         self._head_losses = {head: LOSSES[HEADS[head].loss] for head in self.head_weights}
         self._mask_places = mask_places(self.head_weights)
         self.decoders = nn.ModuleDict({head: Decoder(HEADS[head].channels) for head in HEAD_SETS[heads].heads})
-        initialise(self.encoder, seeded_generator(encoder_seed, "encoder"))
+        initialise(self.encoder, seeded_generator(encoder_seed, "encoder weights"))
         for head, decoder in self.decoders.items():
-            initialise(decoder, seeded_generator(encoder_seed, f"decoder {head}"))
+            initialise(decoder, seeded_generator(encoder_seed, f"decoder weights {head}"))
         self.metrics = ("loss", *(f"loss_{head}" for head in self.decoders), *(["loss_kl"] if settings.beta else []))
         self.noise_seed = encoder_seed
         self.noise: torch.Generator | None = None
@@ -97,7 +97,7 @@ class MultiHeadAutoencoder(lightning.LightningModule):
         if not self.beta:
             return None
         if self.noise is None:
-            self.noise = seeded_generator(self.noise_seed, "noise", self.device)
+            self.noise = seeded_generator(self.noise_seed, "encoder noise", self.device)
             if self.noise_state is not None:
                 self.noise.set_state(self.noise_state)
         return torch.randn((count, LATENT), generator=self.noise, device=self.device)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 import math
 from typing import Any
@@ -13,6 +12,7 @@ from torch.nn import functional
 
 from study.config.heads import HEADS
 from study.config.paper import CHANNELS, CORE, IMAGE, KERNEL, LATENT, STRIDE
+from study.randomness import rng
 
 _CORE_NUMBERS = CHANNELS[-1] * CORE * CORE
 PIXELS = HEADS["rec"].channels * IMAGE * IMAGE
@@ -147,6 +147,5 @@ def initialise(network: nn.Module, generator: torch.Generator) -> None:
 
 
 def seeded_generator(seed: int, purpose: str, device: torch.device | str = "cpu") -> torch.Generator:
-    """Return the generator of one purpose of a seed."""
-    digest = hashlib.sha256(f"{seed}/{purpose}".encode()).digest()
-    return torch.Generator(device).manual_seed(int.from_bytes(digest[:7], "big"))
+    """Return torch's generator of one purpose of a seed (see `rng`)."""
+    return torch.Generator(device).manual_seed(int(rng(seed, purpose).integers(2**63)))

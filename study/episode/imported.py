@@ -11,15 +11,13 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from study.config.keys import content_key
 from study.config.settings import FramesSettings
 from study.episode.head import episode_digest, read_json
 from study.errors import BadInputError
+from study.randomness import rng
 
 SCHEMA_VERSION = 1
-_ASSIGN = 4  # purpose of a random generator; `selection` and `frames` have others
 
 
 @dataclass(frozen=True)
@@ -70,7 +68,7 @@ class Imported:
                 f"{self.folder} has {count} drives and a sweep needs 4 or more: two for encoders and two for "
                 "policies, each one to train and one to test; import more, or cut long drives into several Episodes"
             )
-        order = np.random.default_rng([frames.seed, _ASSIGN]).permutation(count).tolist()
+        order = rng(frames.seed, "imported drives").permutation(count).tolist()
         split = min(max(round(count * frames.encoder / (frames.encoder + frames.policy)), 2), count - 2)
         paths = [self.folder / self.drives[place].name for place in order]
         return sorted(paths[:split]), sorted(paths[split:])

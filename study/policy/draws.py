@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from study.policy.networks import WIDTHS, WORD, slots
-
-_INIT, _EPOCH, SUBSET = range(3)  # purposes of random numbers
+from study.randomness import rng
 
 
 class Draws(NamedTuple):
@@ -35,9 +34,9 @@ def draw_epoch(seeds: Sequence[int], epoch: int, frames: int, device: torch.devi
     bits = torch.empty((len(seeds), ends[-1]), dtype=torch.int32, pin_memory=pinned)
     orders, random_words = order.numpy(), bits.numpy()
     for row, seed in enumerate(seeds):
-        rng = np.random.Generator(np.random.SFC64([seed, _EPOCH, epoch]))
-        orders[row] = rng.permutation(frames)
-        random_words[row] = rng.bit_generator.random_raw(math.ceil(ends[-1] / 2)).view(np.int32)[: ends[-1]]
+        generator = rng(seed, f"policy epoch {epoch}", np.random.SFC64)
+        orders[row] = generator.permutation(frames)
+        random_words[row] = generator.bit_generator.random_raw(math.ceil(ends[-1] / 2)).view(np.int32)[: ends[-1]]
     on_device = bits.to(device, non_blocking=True)
     parts = iter([on_device[:, a:b] for a, b in itertools.pairwise(ends)])
     return Draws(order.to(device, non_blocking=True), {name: (next(parts), next(parts)) for name in WIDTHS})
@@ -45,8 +44,8 @@ def draw_epoch(seeds: Sequence[int], epoch: int, frames: int, device: torch.devi
 
 def initial_weights(seed: int) -> Iterator[tuple[str, Tensor]]:
     """Yield one policy's weights by name, as torch's Linear draws them: uniform within 1 / sqrt(inputs)."""
-    rng = np.random.default_rng([seed, _INIT])
+    generator = rng(seed, "policy weights")
     for name, widths in WIDTHS.items():
         for slot in slots(name):
             bound = widths[slot.layer] ** -0.5
-            yield slot.key, torch.from_numpy(rng.uniform(-bound, bound, slot.shape).astype(np.float32))
+            yield slot.key, torch.from_numpy(generator.uniform(-bound, bound, slot.shape).astype(np.float32))

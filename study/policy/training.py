@@ -18,10 +18,10 @@ from study.compute.trainer import trainer
 from study.config.paper import ACCELERATIONS, LATENT
 from study.config.settings import PolicySettings
 from study.errors import BadInputError, TrainingDivergedError
-from study.policy.draws import SUBSET
 from study.policy.ensemble import PolicyData, PolicyEnsemble
 from study.policy.latents import Arrays, normalisation, normalise
 from study.policy.metrics import METRICS, SPLITS, Labels
+from study.randomness import rng
 from study.results.cell_result import CURVE_COLUMNS
 
 Log = Callable[[int, dict[str, float]], None]
@@ -173,7 +173,7 @@ def _policy_data(scaling: Arrays, train: Labelled, test: Labelled, device: torch
         )
 
     (x_train, y_train), view = on_device(*train), on_device(*test)
-    drawn = np.random.default_rng(SUBSET).permutation(len(x_train))[: len(view[0])]
+    drawn = rng(0, "policy train metrics").permutation(len(x_train))[: len(view[0])]
     part = torch.from_numpy(np.sort(drawn)).to(device)
     return PolicyData(
         x_train, y_train, {"train": (x_train[part], Labels(*(values[part] for values in y_train))), "test": view}

@@ -15,6 +15,7 @@ from study.config.paper import ACCELERATIONS
 from study.config.settings import TownSettings
 from study.episode.schema import GREEN
 from study.errors import BadInputError
+from study.randomness import rng
 from study.sim.autopilot import (
     BRAKE,
     DT,
@@ -246,7 +247,7 @@ def make_traffic(settings: TownSettings, seed: int, *, fast: bool = True) -> Tra
 
     Raises BadInputError when the settings cannot be met.
     """
-    map_rng, light_rng, traffic_rng = (np.random.default_rng((seed, purpose)) for purpose in range(3))
+    map_rng, light_rng, traffic_rng = (rng(seed, purpose) for purpose in ("town", "lights", "traffic"))
     town = draw_town(settings, map_rng)
     room = sum(town.strips[entry].piece.length for entry in town.ways)
     if settings.vehicles * 2 * APART > room:
