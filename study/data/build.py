@@ -17,6 +17,7 @@ import pandas as pd
 from filelock import FileLock
 from numpy.typing import NDArray
 
+from study.atomic import write_atomic
 from study.config.heads import further_masks, mask_heads
 from study.config.keys import FORMAT_VERSIONS, content_key
 from study.config.settings import BirdviewSettings, FramesSettings
@@ -237,12 +238,7 @@ class _Build:
 
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:
-    draft = path.with_suffix(".draft")
-    with draft.open("w", encoding="utf-8") as stream:
-        json.dump(content, stream, indent=1, allow_nan=False)
-        stream.flush()
-        os.fsync(stream.fileno())
-    draft.replace(path)
+    write_atomic(path, json.dumps(content, indent=1, allow_nan=False).encode())
 
 
 def _render_part(

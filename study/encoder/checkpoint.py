@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import io
-import os
 import pickle
-import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from study.atomic import write_atomic
 from study.errors import BadInputError
 
 DIGEST_BYTES = hashlib.sha256().digest_size  # before what torch writes
@@ -34,19 +33,10 @@ class DamagedCheckpointError(Exception):
 
 def write_checkpoint(path: Path, content: dict[str, Any]) -> None:
     """Write a checkpoint and its digest, atomically."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     stream = io.BytesIO()  # torch turns the error of a full disk into one of its own, and keeps no digest
     torch.save(content, stream)
-    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as draft:
-        try:
-            draft.write(hashlib.sha256(stream.getbuffer()).digest())
-            draft.write(stream.getbuffer())
-            draft.flush()
-            os.fsync(draft.fileno())
-            Path(draft.name).replace(path)
-        except BaseException:
-            Path(draft.name).unlink(missing_ok=True)
-            raise
+    raw = stream.getvalue()
+    write_atomic(path, hashlib.sha256(raw).digest() + raw)
 
 
 def read_checkpoint(path: Path, training: dict[str, Any]) -> dict[str, Any]:
