@@ -59,8 +59,8 @@ def welch(first: Sequence[float] | Array, second: Sequence[float] | Array, kind:
 
 def improvement(first: Array, second: Array) -> float:
     """Return the probability that a run of the first beats a run of the second; ties count half."""
-    found = scipy_stats.mannwhitneyu(first, second, method="asymptotic")
-    return float(found.statistic) / (len(first) * len(second))
+    test = scipy_stats.mannwhitneyu(first, second, method="asymptotic")
+    return float(test.statistic) / (len(first) * len(second))
 
 
 def detectable(differences: Array) -> float:

@@ -97,8 +97,7 @@ def varied(one: StudySettings, other: StudySettings) -> Confound | None:
         {f"{group}.{name}": value for group, part in settings for name, value in part} for settings in (one, other)
     )
     names = [name for name in here if here[name] != there[name]]
-    found = [confound for confound in CONFOUNDS if [confound.setting] == names]
-    return found[0] if found else None
+    return next((confound for confound in CONFOUNDS if [confound.setting] == names), None)
 
 
 def value(settings: StudySettings, setting: str) -> str:

@@ -72,8 +72,8 @@ def _recall(index: int) -> Values:
 
     def values(result: CellResult) -> Array:
         frames = result.predictions["acceleration_label"] == index
-        found = result.predictions["acceleration"][:, frames] == index
-        return np.asarray(found.sum(axis=1) / max(frames.sum(), 1))
+        right = result.predictions["acceleration"][:, frames] == index
+        return np.asarray(right.sum(axis=1) / max(frames.sum(), 1))
 
     return values
 

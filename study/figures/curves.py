@@ -205,22 +205,22 @@ def compare_fractions(
     figure, panels = new_figure(2.6, columns=2)
     metrics = ("steering_loss", "acceleration_accuracy")
     for axes, metric, scale in zip(panels, metrics, (1000.0, 100.0), strict=True):
-        own, ends = scores[scores["metric"] == metric], []
-        for index, (name, rows) in enumerate(own.groupby("heads", sort=False)):
+        shown, ends = scores[scores["metric"] == metric], []
+        for index, (name, rows) in enumerate(shown.groupby("heads", sort=False)):
             heads, points = look(str(name)), rows.sort_values("fraction")
             ends.append((scale * float(points["mean"].iloc[-1]), heads.name, heads.colour))
             _bars(axes, points, scale, heads, shift=1 + 0.03 * index)
-        ticks = sorted(own["fraction"].unique())
+        ticks = sorted(shown["fraction"].unique())
         axes.set(xscale="log", xlabel="share of the encoder's training data [%]")
         axes.set_xticks(ticks, [f"{100 * tick:g}" for tick in ticks])
         axes.set_xticks([], minor=True)
         axes.set_xlim(ticks[0] / 1.2, ticks[-1] * 1.2)
         if axes is panels[0]:
             axes.set_title("(a) Steering loss, test")
-            _loss_axis(axes, own.assign(epoch=1), steering_floor)
+            _loss_axis(axes, shown.assign(epoch=1), steering_floor)
         else:
             axes.set_title("(b) Acceleration accuracy, test")
-            _accuracy_axis(axes, own.assign(epoch=1), accuracy_floor, ceiling or 0.0)
+            _accuracy_axis(axes, shown.assign(epoch=1), accuracy_floor, ceiling or 0.0)
             if ceiling:
                 axes.axhline(100 * ceiling, color=GREY, linewidth=0.8, linestyle=CEILING_LINE)
                 ends.append((100 * ceiling, CEILING_WORDS, GREY))

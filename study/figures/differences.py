@@ -16,7 +16,7 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from study.config.paper import ACCELERATIONS
-from study.figures.style import BLUE, GREY, SIDES, STYLE, VERMILION, literal, look, new_figure
+from study.figures.style import BLUE, GREY, SIDES, STYLE, literal, look, new_figure
 
 
 @mpl.rc_context(STYLE)
@@ -98,39 +98,31 @@ def confusions(tables: Sequence[tuple[str, NDArray[np.float64]]]) -> Figure:
     return figure
 
 
-@mpl.rc_context(STYLE)
-def both_values(rows: Sequence[Mapping[str, Any]], setting: str, values: tuple[str, str]) -> Figure:
-    """Draw differences in accuracy [points] under two values of a setting, with their intervals.
-
-    Each row has name, and here and there with value, low, high (shares, not points).
-    """
-    figure, (axes,) = new_figure(0.75 + 0.34 * len(rows))
-    colours = "black", VERMILION
-    for side, value, shift, colour, (marker, fill) in zip(
-        ("here", "there"), values, (-0.14, 0.14), colours, SIDES, strict=True
-    ):
-        middle, low, high = _columns([row[side] for row in rows], ("value", "low", "high"))
-        places = np.arange(len(rows)) + shift
-        axes.hlines(places, low, high, color=colour, linewidth=1.4)
-        style: dict[str, Any] = {"color": colour, "markerfacecolor": fill or colour, "markersize": 4}
-        axes.plot(middle, places, marker, linestyle="none", label=f"{setting} {value}", **style)
-    _difference_axes(axes, [str(row["name"]) for row in rows], (len(rows) - 0.5, -0.5))
-    figure.legend(loc="outside upper right", ncols=2)
-    return figure
-
-
-Range = tuple[float, float | None, float | None]  # a value and the ends of its interval, as shares
+Range = tuple[float, float, float]  # a value and the ends of its interval, as shares
 
 
 @dataclass(frozen=True)
 class Pair:
-    """A head set and fraction in two sweeps: None where a sweep has none, or no difference, as the baseline."""
+    """A head set and fraction on two sides: None where a side has none, or no difference, as the baseline."""
 
     label: str
     heads: str
     fraction: float
     scores: tuple[Range | None, ...]
     differences: tuple[Range | None, ...]
+
+
+@mpl.rc_context(STYLE)
+def both_values(rows: Sequence[Pair], names: tuple[str, str]) -> Figure:
+    """Draw the rows' differences in accuracy [points] on both sides, with their intervals; `names` are the sides'."""
+    figure, (axes,) = new_figure(0.75 + 0.34 * len(rows))
+    places = np.arange(len(rows), dtype=np.float64)
+    for row, place in zip(rows, places, strict=True):
+        _sides(axes, row.differences, place, 0.14, row.heads, "+.2f")
+    _difference_axes(axes, [row.label for row in rows], (len(rows) - 0.5, -0.5))
+    axes.margins(x=0.12)
+    figure.legend(_keys(), names, loc="outside upper right", ncols=2)
+    return figure
 
 
 @mpl.rc_context(STYLE)
@@ -147,9 +139,7 @@ def two_sweeps(rows: Sequence[Pair], names: tuple[str, str], baselines: tuple[st
     for axes, part, spec in zip(panels, ("scores", "differences"), (".1f", "+.2f"), strict=False):
         for place, row in zip(places, rows, strict=True):
             axes.axhline(place, color=GREY, alpha=0.25, linewidth=0.4, zorder=0)
-            shift = 0.0 if None in row.scores else 0.2
-            for found, mark, y in zip(getattr(row, part), SIDES, (place - shift, place + shift), strict=True):
-                _dot(axes, found, y, look(row.heads).colour, mark, spec)
+            _sides(axes, getattr(row, part), place, 0.0 if None in row.scores else 0.2, row.heads, spec)
         axes.set_yticks(places, [literal(row.label) for row in rows] if part == "scores" else [""] * len(rows))
         axes.set_ylim(places[-1] + 0.6, -0.6)
         _without_left_side(axes)
@@ -160,31 +150,36 @@ def two_sweeps(rows: Sequence[Pair], names: tuple[str, str], baselines: tuple[st
         axes.axvline(0, color=GREY, linewidth=0.6)
         axes.set_title(f"(b) Difference to {literal(' or '.join(dict.fromkeys(baselines)))}")
         axes.set_xlabel("difference in accuracy [percentage points]")
-    keys = [
-        Line2D([], [], color="black", marker=marker, markerfacecolor=fill or "black", markersize=4)
-        for marker, fill in SIDES
-    ]
-    figure.legend(keys, [literal(name) for name in names], loc="outside upper left")
+    figure.legend(_keys(), [literal(name) for name in names], loc="outside upper left")
     figure.supxlabel(note, x=0.01, ha="left", fontsize=6.5, color=GREY)
     return figure
 
 
-def _dot(axes: Axes, found: Range | None, y: float, colour: str, mark: tuple[str, str | None], spec: str) -> None:
-    """Draw a value with its interval, and its number beside it."""
-    if found is None:
-        return
-    value, low, high = (math.nan if end is None else 100 * end for end in found)
-    axes.hlines(y, low, high, color=colour, linewidth=1.4)
-    axes.plot([value], [y], mark[0], color=colour, markerfacecolor=mark[1] or colour, markersize=3.6)
-    text, end = format(value, spec), value if math.isnan(high) else high
-    text = text.replace("-", "\N{MINUS SIGN}") if float(text) else text.lstrip("+-")
-    axes.annotate(
-        text,
-        (end, y),
-        (5, 0),
-        textcoords="offset points",
-        color=GREY,
-        va="center",
-        fontsize=6,
-        bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.8},  # above the row's line
-    )
+def _keys() -> list[Line2D]:
+    """Return the legend's marks of the two sides."""
+    return [
+        Line2D([], [], color="black", linestyle="none", marker=marker, markerfacecolor=fill or "black", markersize=4)
+        for marker, fill in SIDES
+    ]
+
+
+def _sides(axes: Axes, pair: Sequence[Range | None], place: float, shift: float, heads: str, spec: str) -> None:
+    """Draw the values of both sides with their intervals, and their numbers beside them."""
+    colour = look(heads).colour
+    for bar, (marker, fill), y in zip(pair, SIDES, (place - shift, place + shift), strict=True):
+        if bar is None:
+            continue
+        value, low, high = (100 * end for end in bar)
+        axes.hlines(y, low, high, color=colour, linewidth=1.4)
+        axes.plot([value], [y], marker, color=colour, markerfacecolor=fill or colour, markersize=3.6)
+        text, end = format(value, spec), value if math.isnan(high) else high
+        axes.annotate(
+            text.replace("-", "\N{MINUS SIGN}") if float(text) else text.lstrip("+-"),
+            (end, y),
+            (5, 0),
+            textcoords="offset points",
+            color=GREY,
+            va="center",
+            fontsize=6,
+            bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.8},  # above the row's line
+        )

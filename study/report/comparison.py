@@ -107,13 +107,10 @@ def _differing(sides: Sides) -> tuple[Rows, list[str]]:
 
 def _facts(report: Report) -> Iterator[tuple[str, str]]:
     """Yield name and value of everything that two sweeps may differ in; a name's first word is its group."""
-    sweep, origin = report.sweep, report.provenance
-    for name in (
-        *("name", "simulator", "profile", "design", "encoder_seeds", "policy_seeds", "policy_epochs", "baseline"),
-    ):
-        yield f"sweep {name}", str(getattr(sweep, name))
+    origin, sweep = report.provenance, report.sweep.model_dump(exclude={"title", "heads", "fractions", "failed"})
+    for name, value in sweep.items():
+        yield f"sweep {name}", ", ".join(value) if isinstance(value, tuple) else str(value)
     yield "sweep cells", ", ".join(row.cell for row in report.scores)
-    yield "sweep finished", f"{sweep.finished} of {sweep.planned}"
     yield "commit", f"{origin.commit or 'unknown'}{' with uncommitted changes' * bool(origin.dirty)}"
     yield "data key", str(report.data.key)
     for name, content in report.data.sets.items():

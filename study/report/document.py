@@ -108,9 +108,9 @@ def parse(text: str, pictures: Mapping[str, str]) -> Iterator[Block]:
         elif figure := re.fullmatch(r"Figure: (\S+) (.*) Alt: (.*)", words):
             if figure[1] in pictures:
                 yield Picture(pictures[figure[1]], figure[2], figure[3])
-        elif found := re.fullmatch(r"Table:(.*?)((?:^\|[^\n]*\n?)+)(.*)", block, re.DOTALL | re.MULTILINE):
-            header, marks, *rows = (_cells(line) for line in found[2].splitlines())
-            caption, notes = (" ".join(part.split()) for part in (found[1], found[3]))
+        elif match := re.fullmatch(r"Table:(.*?)((?:^\|[^\n]*\n?)+)(.*)", block, re.DOTALL | re.MULTILINE):
+            header, marks, *rows = (_cells(line) for line in match[2].splitlines())
+            caption, notes = (" ".join(part.split()) for part in (match[1], match[3]))
             align = "".join("c" if mark[0] == ":" else "r" if mark[-1] == ":" else "l" for mark in marks)
             if rows:
                 yield Table(header, align, tuple(rows), caption, notes)

@@ -10,6 +10,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from study.analysis import effects, intervals, learning_curves, predictions
+from study.analysis.intervals import Estimate
 from study.analysis.learning_curves import ACCURACY, STEERING
 from study.config.heads import CEILING, HEADS
 from study.errors import BadInputError
@@ -105,7 +106,15 @@ def _confound(row: Confound) -> Drawing | None:
     pairs = row.contrasts
     if not pairs or math.isnan(pairs[0].here.low) or math.isnan(pairs[0].there.low):
         return None
-    return differences.both_values([asdict(pair) for pair in pairs], row.setting, (row.here, row.there or ""))
+    rows = [
+        differences.Pair(pair.name, *pair.first, (None, None), (_range(pair.here), _range(pair.there)))
+        for pair in pairs
+    ]
+    return differences.both_values(rows, (f"{row.setting} {row.here}", f"{row.setting} {row.there}"))
+
+
+def _range(estimate: Estimate | None) -> differences.Range | None:
+    return (estimate.value, estimate.low, estimate.high) if estimate else None
 
 
 # --- pictures of frames and latents ---------------------------------------------------------------------------------
@@ -192,14 +201,9 @@ def draw_sweeps(first: Report, second: Report, names: tuple[str, str]) -> Drawin
     rows = []
     for point, label in cells.items():
         scores = [side.by_point[point].accuracy if point in side.by_point else None for side in sides]
-        gains = [side.above_baseline(point) for side in sides]
+        ranges = tuple((row.mean, row.low, row.high) if row else None for row in scores)
         rows.append(
-            differences.Pair(
-                label,
-                *point,
-                tuple((row.mean, row.low, row.high) if row else None for row in scores),
-                tuple((row.value, row.low, row.high) if row else None for row in gains),
-            )
+            differences.Pair(label, *point, ranges, tuple(_range(side.above_baseline(point)) for side in sides))
         )
     keys = (side_key("first", first, names[0]), side_key("second", second, names[1]))
     return differences.two_sweeps(rows, keys, (first.sweep.baseline, second.sweep.baseline), ends_text(first, second))

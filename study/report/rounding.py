@@ -49,9 +49,9 @@ def between(low: float, high: float, show: Show) -> str:
     return ends[0] if math.isnan(low) or math.isinf(low) else " to ".join(ends)
 
 
-def interval(found: Estimate | Spread | None, show: Show) -> str:
+def interval(estimate: Estimate | Spread | None, show: Show) -> str:
     """Return the interval of an estimate or a score."""
-    return between(found.low, found.high, show) if found else NOTHING
+    return between(estimate.low, estimate.high, show) if estimate else NOTHING
 
 
 def kinds(rows: Iterable[Estimate | Spread]) -> str:

@@ -237,9 +237,9 @@ def _data(record: SweepRecord) -> Data:
         name: {"drives": len(sources.get(name, ())), **{field: content.get(field) for field in fields}}
         for name, content in record.data.get("sets", {}).items()
     }
-    for own in sets.values():
-        if isinstance(own["test_drives"], list):
-            own["test_drives"] = len(own["test_drives"])
+    for content in sets.values():
+        if isinstance(content["test_drives"], list):
+            content["test_drives"] = len(content["test_drives"])
     return Data(key=record.data.get("key"), sets=sets)
 
 
@@ -269,14 +269,14 @@ def _cost(record: SweepRecord) -> Cost:
 
 
 def _provenance(record: SweepRecord) -> Provenance:
-    own = record.provenance
-    packages = own.get("packages", {})
+    origin = record.provenance
+    packages = origin.get("packages", {})
     commits = {result.facts.get("provenance", {}).get("commit") for result in record.results.values()}
     return Provenance(
-        **{name: own.get(name) for name in ("commit", "dirty", "lock", "python", "platform", "cpu", "cores")},
-        diff_lines=len(str(own.get("diff") or "").splitlines()),
+        **{name: origin.get(name) for name in ("commit", "dirty", "lock", "python", "platform", "cpu", "cores")},
+        diff_lines=len(str(origin.get("diff") or "").splitlines()),
         packages={name: packages[name] for name in SHOWN_PACKAGES if name in packages},
         cell_commits=tuple(sorted(str(commit) for commit in commits if commit)),
-        command=own.get("command", f"python -m study.sweep {record.grid.name} --profile {record.profile}"),
+        command=origin.get("command", f"python -m study.sweep {record.grid.name} --profile {record.profile}"),
         keys={cell.label: key for key, cell in record.planned.items()},
     )
