@@ -144,34 +144,18 @@ def _policy_seconds(work: Work) -> float:
     return work.policy_seeds * work.settings.policy.epochs * work.settings.frames.policy * POLICY_FRAME_S
 
 
-def _recording_key(work: Work) -> str:
-    return recording_key(work.settings)
-
-
-def _frames_key(work: Work) -> str:
-    return frames_key(work.settings)
-
-
-def _encoder_key(work: Work) -> str:
-    return encoder_key(work.settings, work.cell, work.frames)
-
-
 def _cell_key(work: Work) -> str:
     return cell_key(work.settings, work.cell, work.policy_seeds, work.frames)
 
 
-def _no_seconds(_: Work) -> float:
-    return 0.0
-
-
-RECORD = Stage("record", "recording drives", "drive", _recording_key, _record_seconds)
-SELECT = Stage("select", "choosing frames", "drive", _frames_key, _no_seconds)
-RENDER = Stage("render", "rendering frames", "frame", _frames_key, _render_seconds)
-DESCRIBE = Stage("describe", "describing the data", "card", _frames_key, _no_seconds)
-ENCODER = Stage("encoder", "encoder", "step", _encoder_key, _encoder_seconds)
-LATENTS = Stage("latents", "encoding", "frame", _encoder_key, _latents_seconds)
+RECORD = Stage("record", "recording drives", "drive", lambda work: recording_key(work.settings), _record_seconds)
+SELECT = Stage("select", "choosing frames", "drive", lambda work: frames_key(work.settings), lambda _: 0.0)
+RENDER = Stage("render", "rendering frames", "frame", SELECT.key, _render_seconds)
+DESCRIBE = Stage("describe", "describing the data", "card", RENDER.key, lambda _: 0.0)
+ENCODER = Stage("encoder", "encoder", "step", lambda w: encoder_key(w.settings, w.cell, w.frames), _encoder_seconds)
+LATENTS = Stage("latents", "encoding", "frame", ENCODER.key, _latents_seconds)
 POLICY = Stage("policy", "policies", "epoch", _cell_key, _policy_seconds)
-RESULT = Stage("result", "assembling the result", "cell", _cell_key, lambda _: RESULT_S)
+RESULT = Stage("result", "assembling the result", "cell", POLICY.key, lambda _: RESULT_S)
 
 DATA_STAGES = (RECORD, SELECT, RENDER, DESCRIBE)
 CELL_STAGES = (ENCODER, LATENTS, POLICY, RESULT)

@@ -19,10 +19,11 @@ from study.config.heads import CEILING
 from study.errors import BadInputError
 from study.products import Product, read_product, write_product
 from study.results.cell_result import CellResult
-from study.stages import ENCODER, LATENTS, POLICY, RESULT, Batch, Flow, Task
+from study.stages import ENCODER, LATENTS, POLICY, RESULT, Batch, Flow, Stage, Task
 
 SHARE_SECONDS = 40.0  # on one core of the reference machine, of a share of the policies: what a kill costs at most
 HEAD = "product.json"
+STAGE_MODULE = "study.cell.stages"
 
 
 def cell_flow(job: CellJob, *, one_share: bool = False) -> Flow[tuple[CellResult, bytes]]:
@@ -34,22 +35,22 @@ def cell_flow(job: CellJob, *, one_share: bool = False) -> Flow[tuple[CellResult
     encoder = None
     if job.cell.heads != CEILING:
         folder = job.products / f"encoder-{ENCODER.key(job.work)}"
-        task = Task(ENCODER, "study.cell.stages:train_cell_encoder", (job,), reports=True, accelerated=True)
-        (encoder,) = yield from _keep([folder], ("weights", "samples"), [task])
-    (latents,) = yield Batch(
-        [Task(LATENTS, "study.cell.stages:encode_policy_set", (job, encoder), reports=True, accelerated=True)]
-    )
-    share_count = 1 if one_share else min(job.policy_seeds, math.ceil(2 * POLICY.cost(job.work) / SHARE_SECONDS))
-    shares = [share.tolist() for share in np.array_split(np.arange(job.policy_seeds), share_count)]
-    train = "study.cell.stages:train_policy_share"
+        (encoder,) = yield from _keep([folder], ("weights", "samples"), [_task(ENCODER, "train_cell_encoder", job)])
+    (latents,) = yield Batch([_task(LATENTS, "encode_policy_set", job, encoder)])
+    count = 1 if one_share else min(job.policy_seeds, math.ceil(2 * POLICY.cost(job.work) / SHARE_SECONDS))
+    shares = [share.tolist() for share in np.array_split(np.arange(job.policy_seeds), count)]
     policies = yield from _keep(
         [job.products / f"policies-{job.key}-{seeds[0]}-{seeds[-1]}" for seeds in shares],
         ("weights", "predictions"),
-        [Task(POLICY, train, (job, latents, seeds), len(seeds), reports=True, accelerated=True) for seeds in shares],
+        [_task(POLICY, "train_policy_share", job, latents, seeds, weight=len(seeds)) for seeds in shares],
     )
     result: tuple[CellResult, bytes]
-    (result,) = yield Batch([Task(RESULT, "study.cell.stages:assemble_result", (job, encoder, latents, policies))])
+    (result,) = yield Batch([Task(RESULT, f"{STAGE_MODULE}:assemble_result", (job, encoder, latents, policies))])
     return result
+
+
+def _task(stage: Stage, function: str, *args: Any, weight: int = 1) -> Task:
+    return Task(stage, f"{STAGE_MODULE}:{function}", args, weight, reports=True, accelerated=True)
 
 
 def product_folders(job: CellJob) -> list[Path]:

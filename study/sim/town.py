@@ -43,7 +43,7 @@ class Town:
     `enter`, `leave`: [M, M] m, where along movement a the front bumper enters, and the rear bumper leaves, the space of
     vehicles on movement b; NaN if they never meet.
     `opposing`: [M, M] bool, whether b comes from the arm across. `signal_of`: strip -> its signal, -1 where none.
-    `phases`: node -> number of phases of its lights, 0 where there are none. `junctions`: nodes of three or more arms.
+    `phases`: node -> number of phases of its lights, 0 where there are none.
     """
 
     strips: tuple[Strip, ...]
@@ -52,7 +52,6 @@ class Town:
     signals: tuple[Signal, ...]
     signal_of: NDArray[np.int64]
     phases: tuple[int, ...]
-    junctions: tuple[int, ...]
     enter: Floats
     leave: Floats
     opposing: NDArray[np.bool_]
@@ -188,7 +187,7 @@ def _lay_out(
         draft.add_street(*street, lanes[street])
     for node in range(nodes):
         draft.add_junction(node)
-    return draft.finish(degrees)
+    return draft.finish()
 
 
 def _all_reachable(town: Town) -> bool:
@@ -274,7 +273,7 @@ class _Draft:
                 line = np.array([[x, y], [x, y]]) + np.array([-half, half])
                 self.signals.append(Signal(node, entry, arm % 2, line))
 
-    def finish(self, degrees: list[int]) -> Town:
+    def finish(self) -> Town:
         ways: dict[int, list[int]] = {}
         for number, movement in enumerate(self.movements):
             ways.setdefault(movement.entry, []).append(number)
@@ -296,7 +295,6 @@ class _Draft:
             signals=tuple(self.signals),
             signal_of=signal_of,
             phases=tuple(self.phases),
-            junctions=tuple(node for node, degree in enumerate(degrees) if degree >= 3),
             enter=enter,
             leave=leave,
             opposing=opposing,
