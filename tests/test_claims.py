@@ -104,7 +104,7 @@ def test_planned_contrasts_of_the_paper():
 
 def test_comparisons_are_corrected_for_planned_contrasts_that_are_not_there_yet():
     record = simulate(HEADS_GRID, World(epochs=12), unfinished=("rec+plan 100% e0", "rec+pred 100% e0"))
-    contrast = effects.compare(
+    contrast = effects.paired_contrasts(
         record, learning_curves.ACCURACY, learning_curves.panel(record.table(), learning_curves.ACCURACY)
     )
     assert [(item.first[0], item.second[0]) for item in contrast] == [("full", "rec")]

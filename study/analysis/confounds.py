@@ -70,7 +70,7 @@ Movement = Literal["moved", "open"]
 
 
 @dataclass(frozen=True)
-class Contrast:
+class ContrastChange:
     """A difference in final accuracy under this sweep's setting and under the other, and what it changes by.
 
     `state`: "moved" where the change's interval, widened by the allowance for other encoders, excludes 0.
@@ -106,7 +106,7 @@ def value(settings: StudySettings, setting: str) -> str:
     return str(getattr(getattr(settings, group), name))
 
 
-def contrasts(record: SweepRecord, other: SweepRecord, confound: Confound) -> list[Contrast]:
+def contrasts(record: SweepRecord, other: SweepRecord, confound: Confound) -> list[ContrastChange]:
     """Return every head set against the baseline, at each fraction, that both sweeps have finished."""
     panels = [learning_curves.panel(each.table(), learning_curves.ACCURACY) for each in (record, other)]
     rows = []
@@ -127,7 +127,7 @@ def contrasts(record: SweepRecord, other: SweepRecord, confound: Confound) -> li
         more = record.grid.rules.encoder_allowance if one_encoder else 0.0
         moved = change.low - more > 0 or change.high + more < 0
         rows.append(
-            Contrast(
+            ContrastChange(
                 effects.difference_label(first, second, record.grid),
                 first,
                 second,

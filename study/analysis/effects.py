@@ -85,7 +85,7 @@ def planned(grid: Grid) -> list[tuple[Point, Point]]:
     return contrasts
 
 
-def compare(record: SweepRecord, metric: str, curves: Panel) -> list[Contrast]:
+def paired_contrasts(record: SweepRecord, metric: str, curves: Panel) -> list[Contrast]:
     """Return every planned contrast whose two cells are finished."""
     plan = planned(record.grid)
     level = 1 - record.grid.rules.alpha / max(len(plan), 1)

@@ -102,7 +102,7 @@ Range = tuple[float, float, float]  # a value and the ends of its interval, as s
 
 
 @dataclass(frozen=True)
-class Pair:
+class TwoSided:
     """A head set and fraction on two sides: None where a side has none, or no difference, as the baseline."""
 
     label: str
@@ -113,7 +113,7 @@ class Pair:
 
 
 @mpl.rc_context(STYLE)
-def both_values(rows: Sequence[Pair], names: tuple[str, str]) -> Figure:
+def both_values(rows: Sequence[TwoSided], names: tuple[str, str]) -> Figure:
     """Draw the rows' differences in accuracy [points] on both sides, with their intervals; `names` are the sides'."""
     figure, (axes,) = new_figure(0.75 + 0.34 * len(rows))
     places = np.arange(len(rows), dtype=np.float64)
@@ -126,7 +126,7 @@ def both_values(rows: Sequence[Pair], names: tuple[str, str]) -> Figure:
 
 
 @mpl.rc_context(STYLE)
-def two_sweeps(rows: Sequence[Pair], names: tuple[str, str], baselines: tuple[str, str], note: str) -> Figure:
+def two_sweeps(rows: Sequence[TwoSided], names: tuple[str, str], baselines: tuple[str, str], note: str) -> Figure:
     """Draw the final accuracy [%] of two sweeps, row by row, beside the differences to each one's baseline [points].
 
     `names`: what the key says of each sweep; `note`: a line below. Bars are the intervals given. Without any difference

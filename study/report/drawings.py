@@ -18,7 +18,7 @@ from study.figures import curves, differences, pictures
 from study.figures.style import Drawing
 from study.products import Arrays
 from study.report.comparison import ends_text, labels, side_key
-from study.report.model import Confound, Report
+from study.report.model import Report, VariedSetting
 from study.results.cell_result import CellResult
 from study.results.sweep_record import SweepRecord
 
@@ -101,13 +101,13 @@ def _encoders(record: SweepRecord) -> Drawing:
     )
 
 
-def _confound(row: Confound) -> Drawing | None:
+def _confound(row: VariedSetting) -> Drawing | None:
     """Draw a confound's contrasts under both of its values."""
     pairs = row.contrasts
     if not pairs or math.isnan(pairs[0].here.low) or math.isnan(pairs[0].there.low):
         return None
     rows = [
-        differences.Pair(pair.name, *pair.first, (None, None), (_range(pair.here), _range(pair.there)))
+        differences.TwoSided(pair.name, *pair.first, (None, None), (_range(pair.here), _range(pair.there)))
         for pair in pairs
     ]
     return differences.both_values(rows, (f"{row.setting} {row.here}", f"{row.setting} {row.there}"))
@@ -203,7 +203,7 @@ def draw_sweeps(first: Report, second: Report, names: tuple[str, str]) -> Drawin
         scores = [side.by_point[point].accuracy if point in side.by_point else None for side in sides]
         ranges = tuple((row.mean, row.low, row.high) if row else None for row in scores)
         rows.append(
-            differences.Pair(label, *point, ranges, tuple(_range(side.above_baseline(point)) for side in sides))
+            differences.TwoSided(label, *point, ranges, tuple(_range(side.above_baseline(point)) for side in sides))
         )
     keys = (side_key("first", first, names[0]), side_key("second", second, names[1]))
     return differences.two_sweeps(rows, keys, (first.sweep.baseline, second.sweep.baseline), ends_text(first, second))

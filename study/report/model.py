@@ -118,7 +118,7 @@ class Convergence(Part):
     n: int
 
 
-class Confound(Part):
+class VariedSetting(Part):
     """A setting under both of its values; without contrasts where no sweep varies it."""
 
     setting: str
@@ -127,7 +127,7 @@ class Confound(Part):
     there: str | None
     sweep: str
     floor: Number
-    contrasts: tuple[confounds.Contrast, ...]
+    contrasts: tuple[confounds.ContrastChange, ...]
 
     @property
     def flipped(self) -> list[str]:
@@ -205,7 +205,7 @@ class Report(Part):
     comparisons: tuple[Contrast, ...]
     planned_contrasts: int
     convergence: tuple[Convergence, ...]
-    confounds: tuple[Confound, ...] = ()
+    confounds: tuple[VariedSetting, ...] = ()
     claims: tuple[Verdict, ...]
     rules: dict[str, float]
     settings: tuple[Setting, ...]

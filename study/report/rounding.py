@@ -59,7 +59,7 @@ def kinds(rows: Iterable[Estimate | Spread]) -> str:
     return "; ".join(dict.fromkeys(row.kind for row in rows))
 
 
-def clock(seconds: float) -> str:
+def duration(seconds: float) -> str:
     """Return a time span."""
     return f"{fixed(seconds, 0)} s" if seconds < 100 else NOTHING if math.isnan(seconds) else f"{seconds / 60:.1f} min"
 

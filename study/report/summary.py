@@ -19,7 +19,6 @@ from study.config.paper import parameter_counts
 from study.products import Arrays
 from study.report.model import (
     CellCost,
-    Confound,
     Convergence,
     Cost,
     Data,
@@ -30,6 +29,7 @@ from study.report.model import (
     Setting,
     Spread,
     Sweep,
+    VariedSetting,
 )
 from study.results.cell_result import CellResult
 from study.results.sweep_record import SweepRecord
@@ -42,12 +42,15 @@ NEAR = 30.0  # [m] a lead vehicle farther away may be outside the image
 
 def summarise(record: SweepRecord) -> Report:
     """Return the report of a sweep, over its finished cells."""
-    grid, table = record.grid, record.table()
-    accuracy = learning_curves.panel(table, ACCURACY)
+    grid = record.grid
+    panels = {name: learning_curves.panel(record.table(), name) for name in (ACCURACY, STEERING)}
+    accuracy = panels[ACCURACY]
     finished = {point: accuracy[point] for point in effects.points(grid) if point in accuracy}
     base = accuracy.get((grid.baseline, max(grid.fractions)))
     floor, ceiling = _floor(record), _ceiling(record)
-    contrasts = (effects.compare(record, name, learning_curves.panel(table, name)) for name in (ACCURACY, STEERING))
+    contrasts = (
+        effects.paired_contrasts(record, name, learning_curves.panel(table, name)) for name in (ACCURACY, STEERING)
+    )
     return Report(
         sweep=_sweep(record, "A" if learning_curves.design(accuracy.values()) == "A" else "B"),
         metrics=tuple(METRICS.values()),
@@ -167,11 +170,11 @@ def _convergence(point: Point, cell: str, curves: pd.DataFrame, base: pd.DataFra
     )
 
 
-def _confounds(record: SweepRecord) -> Iterator[Confound]:
+def _confounds(record: SweepRecord) -> Iterator[VariedSetting]:
     """Yield each setting that may confound the sweep's contrasts, with the sweep that varies it where there is one."""
     for confound in confounds.concerned(record):
         other = record.variants.get(confound.setting)
-        yield Confound(
+        yield VariedSetting(
             setting=confound.setting,
             about=confound.about,
             here=confounds.value(record.settings, confound.setting),

@@ -16,7 +16,7 @@ from study.report.document import Block, Inline, bold, code, italic, parse, plai
 from study.report.model import Report, Spread
 from study.report.rounding import LOSS, NOTHING, UNITS, interval, percent, show
 
-ROUNDINGS = ("clock", "epochs", "fixed", "gigabytes", "interval", "kinds", "percent", "points", "probability")
+ROUNDINGS = ("duration", "epochs", "fixed", "gigabytes", "interval", "kinds", "percent", "points", "probability")
 
 
 def render(template: str, pictures: dict[str, str], **values: object) -> list[Block]:
