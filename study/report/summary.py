@@ -48,9 +48,7 @@ def summarise(record: SweepRecord) -> Report:
     finished = {point: accuracy[point] for point in effects.points(grid) if point in accuracy}
     base = accuracy.get((grid.baseline, max(grid.fractions)))
     floor, ceiling = _floor(record), _ceiling(record)
-    contrasts = (
-        effects.paired_contrasts(record, name, learning_curves.panel(table, name)) for name in (ACCURACY, STEERING)
-    )
+    contrasts = (effects.paired_contrasts(record, name, panel) for name, panel in panels.items())
     return Report(
         sweep=_sweep(record, "A" if learning_curves.design(accuracy.values()) == "A" else "B"),
         metrics=tuple(METRICS.values()),
