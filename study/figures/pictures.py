@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from study.config.heads import PAPER_MASKS, mask_heads
 from study.figures.style import LIGHT_COLOUR, LIGHT_WORDS, STYLE, WIDTH, new_figure
 
 Map = tuple[str, NDArray[np.float64], NDArray[np.float64], NDArray[np.float32], NDArray[np.uint8], NDArray[np.float32]]
@@ -87,19 +88,22 @@ def _strip(figure: Figure, place: tuple[float, float, float, float], pictures: N
 
 @mpl.rc_context(STYLE)
 def contact_sheet(sets: Mapping[str, Sequence[tuple[str, NDArray[np.uint8]]]], columns: int = 3) -> Figure:
-    """Draw frames of each set as strips of input, pred and plan, [3, 64, 64, 3] uint8 each, with a text below."""
-    side, words, head = WIDTH / columns / 3.15, 0.27, 0.3  # [in]
+    """Draw frames of each set as strips of input and masks, [1 + K, 64, 64, 3] uint8 each, with a text below."""
+    further = [head.word for head in mask_heads().values() if head.target not in PAPER_MASKS]
+    width = 3 + len(further)
+    side, words, head = WIDTH / columns / (width + 0.15), 0.27, 0.3  # [in]
     lines = {name: -(-len(frames) // columns) for name, frames in sets.items()}
     height = sum(head + rows * (side + words) for rows in lines.values())
     figure, top = Figure(figsize=(WIDTH, height)), height
     for name, frames in sets.items():
         title = f"{name} set, training frames: input, pred (the others' next second), plan (the ego's)"
+        title = ", ".join([title, *further])
         figure.text(0, (top - 0.18) / height, title, fontsize=8)
         top -= head
         for index, (text, pictures) in enumerate(frames):
             row, column = divmod(index, columns)
             left, low = column * WIDTH / columns, top - row * (side + words) - side
-            _strip(figure, (left / WIDTH, low / height, 3 * side / WIDTH, side / height), pictures)
+            _strip(figure, (left / WIDTH, low / height, width * side / WIDTH, side / height), pictures)
             figure.text(left / WIDTH, (low - 0.01) / height, text, fontsize=5.5, va="top", linespacing=1.1)
         top -= lines[name] * (side + words)
     return figure
