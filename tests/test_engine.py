@@ -140,6 +140,16 @@ def test_a_gpu_whose_worker_restarts_is_waited_for(engine, tmp_path, monkeypatch
     assert run_and_record(engine, {"dies": dies, "waits": waits}).products == {"dies": ["alive"], "waits": [GPU, GPU]}
 
 
+def test_a_worker_that_dask_has_given_up_is_replaced(tmp_path, monkeypatch):
+    """On a busy machine a restart can take longer than Dask waits, and a task for the GPU would wait for ever."""
+    monkeypatch.setattr(dask_engine, "SIZE", 0.5)
+    monkeypatch.setitem(dask_engine.CONFIGURATION, "distributed.deploy.lost-worker-timeout", "1ms")
+    with local_engine(1, tmp_path / "scratch", [GPU]) as engine:
+        for accelerated in (True, False):
+            diary = tmp_path / f"diary {accelerated}"
+            assert run_flow(flow(die, (diary, 1), accelerated=accelerated), engine) == ["alive"]
+
+
 def test_a_file_is_seen_by_workers_of_the_same_folder(engine, tmp_path):
     (tmp_path / "token").touch()
     assert engine.workers_see(tmp_path / "token")

@@ -35,6 +35,7 @@ GPU = "GPU"  # the resource that a worker with a GPU has one of
 CONFIGURATION = {
     "distributed.scheduler.allowed-failures": TRIES - 1,  # deaths of a worker with a task, before the task is given up
     "distributed.scheduler.worker-saturation": 1.0,
+    "distributed.deploy.lost-worker-timeout": "2 minutes",  # a busy machine restarts a worker slowly
     "distributed.worker.daemon": False,
     "distributed.worker.memory.target": False,
     "distributed.worker.memory.spill": False,

@@ -6,6 +6,7 @@ import logging
 import os
 import signal
 from collections.abc import Sequence
+from functools import partial
 from multiprocessing import resource_tracker
 from pathlib import Path
 
@@ -50,7 +51,8 @@ def local_engine(workers: int, scratch: Path, gpus: Sequence[str] = ()) -> DaskE
         client = Client(cluster, timeout=60)
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-    return DaskEngine(client, cluster.scheduler_address, cluster)
+    # A worker that does not come back in time is given up by Dask, and started anew when the cluster is scaled again.
+    return DaskEngine(client, cluster.scheduler_address, cluster, partial(cluster.scale, len(kinds)))
 
 
 def visible_gpus(device: str) -> list[str]:
