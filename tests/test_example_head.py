@@ -2,6 +2,8 @@
 
 import json
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +40,8 @@ def test_a_sweep_with_the_example_ends_with_its_report(tmp_path: Path) -> None:
     words = ("light", "--profile", "tiny", "--policy_seeds", "2", "--ceiling", "false")
     completed = sweep(tmp_path, *words, "--heads", "[rec,rec+light]", "--workers", "2")
     assert completed.returncode == 0, completed.stderr
+    report = [sys.executable, "-m", "study.report", "light"]  # another process knows the head from the store
+    subprocess.run(report, cwd=tmp_path, check=True, capture_output=True)
     (manifest,) = (json.loads(path.read_text()) for path in tmp_path.glob("data/frames/*/manifest.json"))
     assert manifest["sets"]["encoder"]["arrays"]["masks"]["shape"] == [40, 3, 512]
     curves = pd.read_parquet(tmp_path / "reports/light/curves.parquet")

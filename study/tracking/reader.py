@@ -143,8 +143,8 @@ class Reader:
             if plan.get("format_version") != PLAN_VERSION:
                 raise ValueError(f"format {plan.get('format_version')}, not {PLAN_VERSION}")  # noqa: TRY301
             planned = {key: Cell.model_validate(cell) for key, cell in plan["planned"].items()}
-            settings = StudySettings.model_validate(plan["settings"])
-            return Grid.model_validate(plan["grid"]), str(plan["profile"]), settings, planned
+            grid = Grid.model_validate(plan["grid"])  # first: it loads the heads that the settings may name
+            return grid, str(plan["profile"]), StudySettings.model_validate(plan["settings"]), planned
         except ValueError as error:  # pydantic's error is one
             raise BadInputError(
                 f"sweep run {run_id} in {self.experiment.uri} was planned by another version of this program "
