@@ -32,7 +32,7 @@ from study.cell.flow import SHARE_SECONDS, cell_flow
 from study.compute.provenance import ROOT, provenance
 from study.config.files import load_profile
 from study.config.paper import LATENT
-from study.config.workspace import DATA
+from study.config.workspace import HERE
 from study.data.prepare import data_flow
 from study.engine.dask_engine import DaskEngine
 from study.engine.flows import run_flow
@@ -129,7 +129,7 @@ def measure_engine(engine: DaskEngine, settings: Any) -> Numbers:
 
 def train_cell(engine: DaskEngine, plan: Plan) -> tuple[CellResult, bytes]:
     """Train the plan's first cell."""
-    run_flow(data_flow(plan.settings, DATA), engine)
+    run_flow(data_flow(plan.settings, HERE.data), engine)
     (job, *_) = cell_jobs(plan, "cpu", 1).values()
     return run_flow(cell_flow(job), engine)
 

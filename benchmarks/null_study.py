@@ -19,7 +19,7 @@ from study.analysis import claims, learning_curves
 from study.analysis.learning_curves import Panel
 from study.config.files import load_grid
 from study.config.heads import HEAD_SETS
-from study.config.workspace import DEFAULT_TRACKING
+from study.config.workspace import HERE
 from study.tracking.tracker import Tracker
 
 
@@ -37,7 +37,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sweep", help="a finished sweep with four encoder seeds or more")
     parser.add_argument("--profile")
-    parser.add_argument("--tracking", default=DEFAULT_TRACKING)
+    parser.add_argument("--tracking", default=HERE.tracking)
     parser.add_argument("--heads", default="rec", help="whose encoders pose (default: rec)")
     options = parser.parse_args()
     record = Tracker(options.tracking).reader.read_sweep(options.sweep, options.profile)

@@ -21,7 +21,7 @@ Environment, of pack unless said otherwise:
   PYTHON   the Python to use (all steps; default: .venv/bin/python beside the code, else python3)
   SWEEP    the sweep, with options of its grid if need be (default: heads)
   THERE    version of the GPU machine's Python, x86-64 (default: 3.12)
-  WHEELS   packages that the GPU machine lacks, as in requirements.lock (default: pydantic and its needs, pyyaml,
+  WHEELS   packages that the GPU machine lacks, as in requirements.lock (default: pydantic and its needs, pyyaml, click,
            safetensors, filelock; "" for none)
   DASK     no (default), or yes: then Dask's wheels (4 MB) travel, too
   RECORD   here (default), or there: then the simulator's wheels (15 MB) travel instead of the drives (0.6 GB), and the
@@ -36,12 +36,12 @@ python=${PYTHON:-$root/.venv/bin/python}
 case $python in */*) python=$(cd "$(dirname "$python")" && pwd)/$(basename "$python") ;; esac
 
 pack() {
-  local folder=$1 there=${THERE:-3.12} record=${RECORD:-here} name platform grid options=() pins=()
+  local folder=$1 there=${THERE:-3.12} record=${RECORD:-here} name platform grid options=() pins=() drives=()
   shift
   [ $# -gt 0 ] || set -- --profile paper
   read -ra grid <<< "${SWEEP:-heads}"
-  local wheels=${WHEELS-pydantic pydantic-core annotated-types typing-inspection typing-extensions pyyaml safetensors filelock}
-  [ "${DASK:-no}" = no ] || wheels+=" distributed dask click cloudpickle fsspec jinja2 markupsafe locket msgpack packaging \
+  local wheels=${WHEELS-pydantic pydantic-core annotated-types typing-inspection typing-extensions pyyaml click safetensors filelock}
+  [ "${DASK:-no}" = no ] || wheels+=" distributed dask cloudpickle fsspec jinja2 markupsafe locket msgpack packaging \
     partd psutil sortedcontainers tblib toolz tornado zict importlib-metadata zipp"
   [ "$record" = here ] || wheels+=" highway-env gymnasium farama-notifications cloudpickle pygame-ce"
   mkdir -p "$folder/wheels"
@@ -59,7 +59,11 @@ pack() {
   fi
   cd "$folder"
   if [ "$record" = here ]; then
-    PYTHONPATH=.${PYTHONPATH:+:$PYTHONPATH} "$python" -m study.data record "$@"
+    while [ $# -gt 1 ]; do # the settings of the drives alone
+      case $1 in --profile | --town.* | --recording.*) drives+=("$1" "$2") ;; esac
+      shift 2
+    done
+    PYTHONPATH=.${PYTHONPATH:+:$PYTHONPATH} "$python" -m study.data record "${drives[@]}"
   fi
   echo "packed: $(du -sh . | cut -f1) in $folder" >&2
 }
@@ -82,7 +86,7 @@ train() {
 import() {
   local words
   mapfile -t words < "$1/settings"
-  PYTHONPATH=$root${PYTHONPATH:+:$PYTHONPATH} exec "$python" -m study.sweep "${words[@]}" --import-results "$1/results"
+  PYTHONPATH=$root${PYTHONPATH:+:$PYTHONPATH} exec "$python" -m study.sweep import "${words[@]}" "$1/results"
 }
 
 case "${1:-} $#" in

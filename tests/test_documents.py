@@ -31,9 +31,7 @@ from mkdocs.config import load_config
 
 from study.config.heads import HEAD_SETS, HEADS
 from study.config.settings import StudySettings
-from study.console.options import Parser
 from study.errors import BadInputError
-from study.sweep.plan import given_plan
 from tests.support.processes import ROOT
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -112,19 +110,15 @@ def run_study(module: str, words: list[str], monkeypatch: pytest.MonkeyPatch) ->
     if (module, words[0]) == ("study.data", "import"):
         assert main(words) == 0
         return
-    if module == "study.sweep" and words[0] not in {"status", "verify", "train"}:
+    if module == "study.sweep" and words[0] not in {"status", "verify", "train", "import"}:
         assert main([*words, *["--dry-run"] * ("--dry-run" not in words)]) == 0
         return
-    parse = Parser.parse
 
-    def stop(parser, args):
-        options = parse(parser, args)
-        if module == "study.sweep":
-            given_plan(options)
+    def stop(_):
         raise ParsedError
 
     with monkeypatch.context() as context:
-        context.setattr(Parser, "parse", stop)
+        context.setattr(f"{module}.__main__.resolve_name", stop)
         with pytest.raises(ParsedError):
             main(words)
 
@@ -177,8 +171,8 @@ def test_the_blocks_of_a_page_run(page, folder, monkeypatch):
 @pytest.mark.parametrize(
     ("code", "error"),
     [
-        ("python -m study.sweep heads --encoder.epohcs 5", SystemExit),
-        ("python -m study.report heads --figures both.svg", SystemExit),
+        ("python -m study.sweep heads --encoder.epohcs 5", BadInputError),
+        ("python -m study.report heads --figures both.svg", BadInputError),
         ("python -m study.sweep verify heads --fractions '[2]'", BadInputError),
         ("make haeds", subprocess.CalledProcessError),
         ("mkdir a/b", subprocess.CalledProcessError),

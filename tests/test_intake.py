@@ -81,11 +81,11 @@ def test_an_import_that_was_stopped_goes_on_and_commits_every_cell_once(here, pl
         return commit(self, *what)
 
     monkeypatch.setattr(Tracker, "commit", stopped)
-    assert main([*PLAN, "--import-results", str(folder)]) == EXIT_INTERRUPTED
+    assert main(["import", *PLAN, str(folder)]) == EXIT_INTERRUPTED
     monkeypatch.setattr(Tracker, "commit", commit)
     assert run_database(here).cell_counts() == {"FINISHED": 1, "KILLED": 1}
     for _ in range(2):
-        assert main([*PLAN, "--import-results", str(folder)]) == 0
+        assert main(["import", *PLAN, str(folder)]) == 0
         assert run_database(here).cell_counts() == {"FINISHED": 2, "KILLED": 1}
 
     record = Tracker().reader.read_sweep("heads")
@@ -103,7 +103,7 @@ def test_what_is_missing_is_listed_and_not_trained(here, plan, folder, empty_sto
     shutil.copy(empty_store, here / "mlruns")
     missing, present = plan.cells
     shutil.rmtree(folder / missing)
-    assert main([*PLAN, "--import-results", str(folder)]) == 0
+    assert main(["import", *PLAN, str(folder)]) == 0
     said = capsys.readouterr().err
     assert f"missing: rec 100% e0 ({missing})" in said
     assert f"full 100% e0 ({present}): imported" in said
@@ -179,7 +179,7 @@ def test_a_spoilt_result_is_named_before_anything_is_committed(plan, folder, how
 )
 def test_a_folder_without_results_is_reported(here, plan, name, said):
     with pytest.raises(BadInputError, match=said):
-        main([*PLAN, "--import-results", name])
+        main(["import", *PLAN, name])
     assert not list(here.glob("mlruns/*.db"))
 
 

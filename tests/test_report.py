@@ -228,7 +228,7 @@ def test_compare_takes_files_folders_and_sweeps_in_mlflow(tracker, committed, tm
         __main__.main(["compare", str(tmp_path), "pair:paper", "--tracking", tracker.experiment.uri])
     with pytest.raises(BadInputError, match=r"cannot read nowhere/report\.json"):
         __main__.main(["compare", str(tmp_path), "nowhere/report.json"])
-    with pytest.raises(BadInputError, match="compare A B"):
+    with pytest.raises(BadInputError, match="Missing argument 'B'"):
         __main__.main(["compare", str(tmp_path)])
 
 
@@ -250,13 +250,13 @@ def test_compare_draws_into_the_file_that_it_is_given(committed, tmp_path, capsy
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["compare", "a", "b", "--profile", "smoke"], "heads:smoke"),
-        (["compare", "a", "b", "--out", "there"], "--figure FILE"),
+        (["compare", "a", "b", "--profile", "smoke"], "No such option '--profile'"),
+        (["compare", "a", "b", "--out", "there"], "No such option '--out'"),
         (["compare", "a", "b", "--figure", "x.jpg"], r"--figure x\.jpg: write \.svg, \.png, \.pdf"),
         (["compare", "a", "b", "--figure", "x"], r"--figure x: write"),
         (["compare", "a", "b", "--figure", "nowhere/x.svg"], "no folder nowhere; make it first"),
         (["compare", "a", "b", "--figure", "folder.png"], "is a folder"),
-        (["heads", "--figure", "x.png"], "is for compare A B"),
+        (["heads", "--figure", "x.png"], "No such option '--figure'"),
     ],
 )
 def test_a_figure_that_cannot_be_is_refused_before_anything_is_read(words, message, tmp_path, monkeypatch):
@@ -289,8 +289,8 @@ def test_the_command_says_what_is_wrong_and_exits_with_2(tracker):
 
 def test_help_needs_no_heavy_library():
     code = (
-        "import sys; from study.report import __main__ as report; report.parser().format_help(); "
+        "import sys; from study.report import __main__ as report; report.main(['--help']); "
         "print(sorted({'mlflow', 'matplotlib', 'scipy', 'typst', 'torch'} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    assert done.stdout.splitlines()[-1] == "[]"

@@ -10,20 +10,21 @@ from pathlib import Path
 
 import pytest
 
-from study.console.options import Parser
 from study.data.__main__ import main as record_drives
 from study.errors import EXIT_AGAIN, EXIT_FAILED, BadInputError
 from study.results.cell_result import load_results
-from study.sweep.options import add_plan_options
-from study.sweep.plan import given_plan
-from study.sweep.train import main
+from study.sweep import __main__
 from study.tracking.tracker import Tracker
+from tests.support.plans import plan_of
 from tests.support.processes import ROOT
 
 SWEEP = ["heads", "--heads", "[rec,full]", "--policy_seeds", "2"]
-SETTINGS = [
+DRIVES = [
     *("--profile", "smoke", "--town.vehicles", "30", "--recording.warm_up", "1", "--recording.duration", "4"),
     *("--recording.encoder_episodes", "2", "--recording.policy_episodes", "2"),
+]
+SETTINGS = [
+    *DRIVES,
     *("--frames.encoder", "40", "--frames.policy", "40"),
     *("--encoder.batch", "16", "--encoder.epochs", "1", "--policy.batch", "16", "--policy.epochs", "5"),
 ]
@@ -48,9 +49,11 @@ metadata.Distribution.from_name = from_name
 
 
 def plan(words=PLAN):
-    parser = Parser()
-    add_plan_options(parser)
-    return given_plan(parser.parse(words))
+    return plan_of(words)
+
+
+def main(words):
+    return __main__.main(["train", *words])
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +62,7 @@ def home(tmp_path_factory):
     folder, before = tmp_path_factory.mktemp("home"), Path.cwd()
     shutil.copytree(ROOT / "sweeps", folder / "sweeps")
     os.chdir(folder)
-    assert record_drives(["record", *SETTINGS]) == 0
+    assert record_drives(["record", *DRIVES]) == 0
     yield folder
     os.chdir(before)
 
@@ -108,7 +111,7 @@ def test_a_library_that_is_missing_is_reported_before_the_data_is_made(home, tmp
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--limit-seconds", "0"], "above 0"),
+        (["--limit-seconds", "0"], "not in the range x>0"),
         (["--device", "cuda:99"], "choose from cpu"),
         (["--out", "/dev/null/results"], "cannot write"),
     ],

@@ -10,12 +10,12 @@ from pydantic import ValidationError
 
 from study.config.grid import Grid
 from study.config.settings import Model, StudySettings
-from study.config.workspace import SWEEPS
+from study.config.workspace import HERE
 from study.errors import BadInputError, one_of
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """A YAML file's mapping. Raises BadInputError when it is missing, broken or no mapping."""
+    """Return a YAML file's mapping. Raises BadInputError when it is missing, broken or no mapping."""
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -30,12 +30,12 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def named_files(folder: Path) -> dict[str, Path]:
-    """Name -> path of the YAML files in a folder, by name."""
+    """Return the path by name of the YAML files in a folder, ordered by name."""
     return {path.stem: path for path in sorted(folder.glob("*.yaml"), key=lambda path: path.stem)}
 
 
 def explain(error: ValidationError, source: str) -> BadInputError:
-    """The clear form of pydantic's complaint."""
+    """Return pydantic's error as one clear line."""
     lines: list[str] = []
     for item in error.errors(include_url=False):
         if item["type"] == "too_short" and lines:  # follows from the error inside, which is told already
@@ -51,7 +51,7 @@ def explain(error: ValidationError, source: str) -> BadInputError:
 
 
 def validated(model: type[Model], content: object, source: str) -> Model:
-    """The content as that model. Raises BadInputError that names the source and every field that is wrong."""
+    """Return the content as that model. Raises BadInputError that names the source and every field that is wrong."""
     try:
         return model.model_validate(content)
     except ValidationError as error:
@@ -59,7 +59,7 @@ def validated(model: type[Model], content: object, source: str) -> Model:
 
 
 def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
-    """`base` with the values of `over`, nested mappings merged."""
+    """Return `base` with the values of `over`, nested mappings merged."""
     merged = dict(base)
     for name, value in over.items():
         below = merged.get(name)
@@ -68,9 +68,9 @@ def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
 
 
 def load_grid(
-    name: str, overrides: dict[str, Any] | None = None, folder: Path = SWEEPS, profile: str = "laptop"
+    name: str, overrides: dict[str, Any] | None = None, folder: Path = HERE.sweeps, profile: str = "laptop"
 ) -> Grid:
-    """The sweep of that name, with that profile's rules. Raises BadInputError for an unknown sweep or setting."""
+    """Return the sweep of that name with a profile's rules. Raises BadInputError for an unknown name or setting."""
     files = named_files(folder)
     if name not in files:
         raise one_of("sweep", name, files or [f"nothing: there are no sweep files in {folder.absolute()}"])
@@ -81,15 +81,15 @@ def load_grid(
 
 
 def _of_profile(value: object, profile: str) -> object:
-    """A rule's number for a profile; what cannot be chosen from stays, for the check to name it."""
+    """Return a rule's number for a profile; leave what is no such choice to validation."""
     if not isinstance(value, dict):
         return value
     numbers = [each for each in value.values() if isinstance(each, int | float)]
     return value.get(profile, max(numbers)) if len(numbers) == len(value) > 0 else value
 
 
-def load_profile(name: str, overrides: dict[str, Any] | None = None, folder: Path = SWEEPS) -> StudySettings:
-    """The profile of that name. Raises BadInputError for an unknown profile or setting."""
+def load_profile(name: str, overrides: dict[str, Any] | None = None, folder: Path = HERE.sweeps) -> StudySettings:
+    """Return the profile of that name. Raises BadInputError for an unknown profile or setting."""
     files = named_files(folder / "profiles")
     if name not in files:
         raise one_of("profile", name, files)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Self
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from study.config.heads import CEILING, HEAD_SETS, load_heads
 from study.config.settings import Count, NotNegative, Settings, Share
 
 Fraction = Annotated[float, Field(gt=0, le=1)]
+OneOrMore = BeforeValidator(lambda value: value if isinstance(value, list | tuple) else (value,)), Field(min_length=1)
 
 
 class Rules(Settings):
@@ -50,8 +51,8 @@ class Grid(Settings):
     name: str
     title: str = Field(description="headline of the report")
     head_modules: tuple[str, ...] = Field((), description="Python modules with further heads and head sets")
-    heads: Annotated[tuple[str, ...], Field(min_length=1)] = Field(description="head sets")
-    fractions: Annotated[tuple[Fraction, ...], Field(min_length=1)] = Field(
+    heads: Annotated[tuple[str, ...], *OneOrMore] = Field(description="head sets")
+    fractions: Annotated[tuple[Fraction, ...], *OneOrMore] = Field(
         (1.0,), description="data fractions in (0, 1] (Sec. V-B)"
     )
     encoder_seeds: Count = Field(1, description="encoders for each head set and fraction")
@@ -75,7 +76,7 @@ class Grid(Settings):
         return self
 
     def cells(self) -> list[Cell]:
-        """The cells in the order they are worth running: one encoder seed of everything first, the ceiling last."""
+        """Return the cells in the order to run: one encoder seed of everything first, the ceiling last."""
         return [
             *(
                 Cell(heads=heads, fraction=fraction, encoder_seed=seed)
@@ -96,7 +97,7 @@ class Cell(Settings):
 
     @property
     def label(self) -> str:
-        """Name for people, e.g. `rec+plan 100% e0`."""
+        """Return a name for people, e.g. `rec+plan 100% e0`."""
         if self.heads == CEILING:
             return f"{CEILING} (ceiling)"
         return f"{self.heads} {self.fraction * 100:g}% e{self.encoder_seed}"

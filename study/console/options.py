@@ -1,104 +1,126 @@
-"""What the commands share: options made from the settings, clear errors, exit codes."""
+"""What the commands share: click options derived from settings models, clear errors, exit codes."""
 
 from __future__ import annotations
 
-import argparse
-import difflib
+import functools
 import os
 import shlex
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NoReturn
 
+import click
 import yaml
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from study.config.grid import Grid
-from study.config.settings import StudySettings
-from study.config.workspace import DEFAULT_TRACKING
+from study.config.files import named_files
+from study.config.workspace import HERE
 from study.console.interrupts import EXITS_AT_ONCE
 from study.errors import EXIT_BAD_INPUT, BadInputError, masked
 
-GRID_OPTIONS = ("heads", "fractions", "encoder_seeds", "policy_seeds", "baseline", "ceiling")
+Decorator = Callable[[Callable[..., Any]], Any]
 
 
-class Parser(argparse.ArgumentParser):
-    """An ArgumentParser that names the nearest option when it meets an unknown one."""
+class YamlValue(click.ParamType[Any]):
+    """A value in YAML's notation, as in a profile: `5`, `[rec, full]`, `{plan: 5}`."""
 
-    def parse(self, args: Sequence[str]) -> argparse.Namespace:
-        """Parse, or exit with code 2 and a message."""
-        known, unknown = self.parse_known_args(args)
-        if unknown:
-            options = [word for word in self.format_help().split() if word.startswith("--")]
-            near = difflib.get_close_matches(unknown[0].split("=")[0], options, n=1, cutoff=0.5)
-            hint = f"; did you mean {near[0]}?" if near else ""
-            self.error(f"unknown setting or word '{unknown[0]}'{hint}")
-        return known
+    name = "value"
 
-    def error(self, message: str) -> NoReturn:
-        """Print the message without the long usage, and exit with code 2."""
-        self.exit(EXIT_BAD_INPUT, f"error: {masked(message)}\nSee python -m {self.prog} --help\n")
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Parse the text; the settings check its type when profile and sweep file are known."""
+        try:
+            return yaml.safe_load(value)
+        except yaml.YAMLError:
+            self.fail(
+                f"'{value}' is not valid YAML; give a value as in a profile, such as 5 or [rec, full]", param, ctx
+            )
 
 
-def _value(text: str) -> Any:
-    try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise argparse.ArgumentTypeError(f"'{text}' is not valid YAML") from error
+def settings_options(model: type[BaseModel], names: Iterable[str] = ()) -> list[Decorator]:
+    """Derive an option from each field of a settings model, or from `names` of them; `--group.field` in nested models.
 
-
-def add_options(parser: argparse.ArgumentParser, model: type[BaseModel], names: Sequence[str] = ()) -> None:
-    """An option for each field of a settings model, `--group.field` where models nest; those not given stay unset."""
-    group = parser.add_argument_group("grid" if model is Grid else "settings")
+    Their values are checked by the model when they are merged with the profile, since heads may come with the sweep.
+    """
+    fields: dict[str, FieldInfo] = {}
     for name in names or model.model_fields:
-        info = model.model_fields[name]
-        kind = info.annotation
+        kind = model.model_fields[name].annotation
         if isinstance(kind, type) and issubclass(kind, BaseModel):
-            group = parser.add_argument_group(name, (kind.__doc__ or "").split("\n", maxsplit=1)[0])
-            for inner, detail in kind.model_fields.items():
-                _add(group, f"{name}.{inner}", detail)
+            fields |= {f"{name}.{inner}": info for inner, info in kind.model_fields.items()}
         else:
-            _add(group, name, info)
+            fields[name] = model.model_fields[name]
+    return [
+        click.option(f"--{name}", name.replace(".", "__"), type=YamlValue(), metavar="V", help=_help(info))
+        for name, info in fields.items()
+    ]
 
 
-def _add(group: Any, name: str, info: FieldInfo) -> None:
-    default = info.get_default(call_default_factory=True) if not info.is_required() else None
-    usual = "" if default is None else f" [{default}]"
-    # A percent sign in argparse's help is a format character.
-    text = f"{info.description or name}{usual}".replace("%", "%%")
-    group.add_argument(f"--{name}", metavar="V", type=_value, default=argparse.SUPPRESS, help=text)
+def _help(info: FieldInfo) -> str:
+    default = None if info.is_required() else info.get_default(call_default_factory=True)
+    return f"{info.description or ''}{'' if default is None else f' [{default}]'}"
 
 
-def add_tracking_option(parser: argparse.ArgumentParser) -> None:
-    """Where the results are kept."""
-    parser.add_argument(
-        "--tracking", default=DEFAULT_TRACKING, metavar="URI", help="MLflow store (default: %(default)s)"
-    )
+def nested(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings that were given, as a profile nests them."""
+    settings: dict[str, Any] = {}
+    for name, value in values.items():
+        group, _, field = name.rpartition("__")
+        if value is not None:
+            (settings.setdefault(group, {}) if group else settings)[field] = value
+    return settings
 
 
-def given(options: argparse.Namespace, names: Sequence[str]) -> dict[str, Any]:
-    """The settings that were given on the command line, nested, for the top-level names."""
-    nested: dict[str, Any] = {}
-    for name, value in vars(options).items():
-        group, _, inner = name.partition(".")
-        if group not in names:
-            continue
-        if inner:
-            nested.setdefault(group, {})[inner] = value
-        else:
-            nested[group] = [value] if group in ("heads", "fractions") and not isinstance(value, list) else value
-    return nested
+def bundled(parameter: str, build: Callable[..., Any], *options: Decorator) -> Decorator:
+    """Give a command some options; it gets what `build` makes of their values as one parameter."""
+
+    def decorate(command: Callable[..., Any]) -> Any:
+        @functools.wraps(command)
+        def call(**values: Any) -> Any:
+            built = build(**{name: values.pop(name) for name in names})
+            return command(**values, **{parameter: built})
+
+        count = len(getattr(call, "__click_params__", ()))
+        for option in reversed(options):
+            option(call)
+        names = [each.name for each in call.__click_params__[count:]]  # type: ignore[attr-defined]
+        return call
+
+    return decorate
 
 
-def study_overrides(options: argparse.Namespace) -> dict[str, Any]:
-    """Overrides of a profile."""
-    return given(options, tuple(StudySettings.model_fields))
+def profile_option() -> Decorator:
+    """Name the profile."""
+    names = ", ".join(named_files(HERE.profiles))
+    return click.option("--profile", default="laptop", metavar="P", help=f"{names} [laptop]")
 
 
-def grid_overrides(options: argparse.Namespace) -> dict[str, Any]:
-    """Overrides of a sweep file."""
-    return given(options, GRID_OPTIONS)
+def tracking_option() -> Decorator:
+    """Name the store of results."""
+    return click.option("--tracking", default=HERE.tracking, metavar="URI", help=f"MLflow store [{HERE.tracking}]")
+
+
+def invoke(
+    default: click.Command,
+    args: Sequence[str],
+    program: str,
+    commands: Mapping[str, click.Command] = MappingProxyType({}),
+) -> int:
+    """Run the command that the first word names, else `default`, and return its exit code.
+
+    The command's context holds the command line as its object. Raises BadInputError for words that it does not take.
+    """
+    command, words, path = default, list(args), f"python -m {program}"
+    if words and words[0] in commands:
+        command, path = commands[words[0]], f"{path} {words.pop(0)}"
+    try:
+        with command.make_context(path, words, obj=masked(f"{path} {shlex.join(words)}")) as context:
+            return int(command.invoke(context))
+    except click.exceptions.Exit as end:  # after --help
+        return end.exit_code
+    except click.UsageError as error:
+        path = error.ctx.command_path if error.ctx else path
+        raise BadInputError(f"{error.format_message().rstrip('.')}; see {path} --help") from None
 
 
 def run(main: Callable[[Sequence[str]], int]) -> NoReturn:
@@ -116,8 +138,3 @@ def run(main: Callable[[Sequence[str]], int]) -> NoReturn:
         sys.stderr.flush()
         os._exit(code)
     sys.exit(code)
-
-
-def typed(module: str, args: Sequence[str]) -> str:
-    """The command line again, for people, without credentials."""
-    return masked(shlex.join(["python", "-m", module, *args]))

@@ -11,7 +11,7 @@ from typing import Any
 from study.config.heads import load_heads
 from study.config.keys import drive_name, frames_key, recording_key
 from study.config.settings import StudySettings
-from study.config.workspace import DATA
+from study.config.workspace import HERE
 from study.engine.flows import run_flow
 from study.episode.imported import Imported
 from study.errors import BadInputError
@@ -22,17 +22,17 @@ POLICY_SEED = 1_000_000  # the policy set's drives are numbered from here: never
 Described = tuple[dict[str, Any], dict[str, bytes]]  # a manifest, and files by name
 
 
-def frames_folder(settings: StudySettings, root: Path = DATA, imported: Imported | None = None) -> Path:
+def frames_folder(settings: StudySettings, root: Path = HERE.data, imported: Imported | None = None) -> Path:
     """Return the folder of the frame store of these settings, made or not, of our town's or of imported drives."""
     return root / "frames" / frames_key(settings, imported.key if imported else None)
 
 
-def drives_folder(settings: StudySettings, root: Path = DATA, imported: Imported | None = None) -> Path:
+def drives_folder(settings: StudySettings, root: Path = HERE.data, imported: Imported | None = None) -> Path:
     """Return the folder of the drives of that frame store, recorded or not."""
     return imported.folder if imported else root / "episodes" / recording_key(settings)
 
 
-def data_flow(settings: StudySettings, root: Path = DATA, imported: Imported | None = None) -> Flow[Path]:
+def data_flow(settings: StudySettings, root: Path = HERE.data, imported: Imported | None = None) -> Flow[Path]:
     """Record and render whatever is missing, and return the frame store's folder.
 
     A damaged store is made again from its drives. Raises BadInputError when the settings cannot be met, the disk is
@@ -66,7 +66,7 @@ def data_flow(settings: StudySettings, root: Path = DATA, imported: Imported | N
     return folder
 
 
-def drives_flow(settings: StudySettings, root: Path = DATA) -> Flow[list[Path]]:
+def drives_flow(settings: StudySettings, root: Path = HERE.data) -> Flow[list[Path]]:
     """Record the drives of our town that are missing, and return all.
 
     Raises BadInputError when the settings cannot be met, or when drives are missing and the simulator is not installed.
@@ -93,17 +93,18 @@ def drives_flow(settings: StudySettings, root: Path = DATA) -> Flow[list[Path]]:
 
 
 def describe_data(
-    folder: Path, drives: Path, settings: StudySettings, imported: Imported | None, head_modules: Sequence[str] = ()
+    root: Path, settings: StudySettings, imported: Imported | None, head_modules: Sequence[str] = ()
 ) -> Described:
     """Return the manifest of the frame store and the files of its data card by name; makes what is missing."""
     from study.data.card import card_files, source_drives  # noqa: PLC0415 - pictures, which training needs not
     from study.data.frames import open_frames  # noqa: PLC0415
 
+    load_heads(head_modules)
+    folder = frames_folder(settings, root, imported)
     if not (folder / "manifest.json").is_file():
-        load_heads(head_modules)
-        run_flow(data_flow(settings, DATA, imported))
+        run_flow(data_flow(settings, root, imported))
     store = open_frames(folder)
-    files = card_files(store, source_drives(store, drives), folder)
+    files = card_files(store, source_drives(store, drives_folder(settings, root, imported)), folder)
     return store.manifest, {path.name: path.read_bytes() for path in files}
 
 

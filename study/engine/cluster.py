@@ -10,6 +10,7 @@ from typing import Any
 
 from distributed import Client, Security
 
+from study.config.workspace import HERE
 from study.engine.cluster_options import CERTIFICATES, certificate_files, check_cluster, is_file, read_jobs
 from study.engine.dask_engine import DaskEngine, configure_dask
 from study.errors import BadInputError, masked
@@ -17,7 +18,7 @@ from study.errors import BadInputError, masked
 CONNECT = 10.0  # [s] within which a scheduler must answer
 
 
-def cluster_engine(cluster: str, certificates: Path | None = None) -> DaskEngine:
+def cluster_engine(cluster: str, certificates: Path | None = None, scratch: Path = HERE.tmp) -> DaskEngine:
     """Connect to a scheduler's address, or start the dask-jobqueue cluster that a YAML file describes.
 
     Raises BadInputError for an address that does not answer or is not secured, certificates that do not match, and a
@@ -26,7 +27,7 @@ def cluster_engine(cluster: str, certificates: Path | None = None) -> DaskEngine
     check_cluster(cluster, certificates)
     configure_dask()
     if is_file(cluster):
-        return start_jobs(*read_jobs(Path(cluster)), cluster)
+        return start_jobs(*read_jobs(Path(cluster)), cluster, scratch)
     try:
         security = _security(certificates) if certificates else None
         client = Client(cluster, security=security, timeout=CONNECT, set_as_default=False)
@@ -39,14 +40,16 @@ def cluster_engine(cluster: str, certificates: Path | None = None) -> DaskEngine
     return DaskEngine(client, masked(cluster))
 
 
-def start_jobs(kind: Callable[..., Any], arguments: Mapping[str, Any], workers: int, source: str) -> DaskEngine:
+def start_jobs(
+    kind: Callable[..., Any], arguments: Mapping[str, Any], workers: int, source: str, scratch: Path = HERE.tmp
+) -> DaskEngine:
     """Start a scheduler here and ask a batch system for workers, over TLS with certificates made for this run."""
     defaults = {
         "cores": 1,
         "processes": 1,
         "memory": "8GB",  # the batch system's limit; Dask's own would count frames that are only mapped
         "worker_extra_args": ["--memory-limit", "0"],
-        "security": _security(_make_certificates(Path("data").absolute() / "tmp" / "certificates")),
+        "security": _security(_make_certificates(scratch.absolute() / "certificates")),
         "protocol": "tls://",
         "silence_logs": logging.CRITICAL,
     }

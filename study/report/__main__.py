@@ -10,71 +10,56 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from pkgutil import resolve_name  # the work is imported when it begins: --help needs none of it
 
-from study.config.files import named_files
-from study.config.workspace import REPORTS, SWEEPS
-from study.console.options import Parser, add_tracking_option, run
-from study.errors import BadInputError
+import click
+
+from study.config.workspace import HERE
+from study.console.options import invoke, run, tracking_option
 
 
-def parser() -> Parser:
-    """Return the command line."""
-    made = Parser(
-        prog="study.report",
-        usage="python -m study.report SWEEP [--profile P] [--format {pdf,md}] [--tracking URI] [--out DIR]\n"
-        "       python -m study.report compare A B [--figure FILE] [--tracking URI]",
-        description="Write the report of a sweep from what MLflow holds: PDF, figures, numbers and the tidy table; or "
-        "the report without figures as Markdown on stdout; or set two sweeps side by side, as Markdown on stdout, with "
-        "a picture.",
-        epilog="A and B: each a report.json, a folder that holds one, or NAME[:PROFILE][@URI] of a sweep in MLflow. "
-        "Examples: python -m study.report heads --profile smoke; "
-        "python -m study.report compare reports/reference/heads heads:laptop --figure both.svg > both.md",
-    )
-    made.add_argument(
-        "words",
-        nargs="+",
-        metavar="SWEEP",
-        help=f"name of a sweep that was run, such as {', '.join(named_files(SWEEPS)) or 'heads'}; or compare A B",
-    )
-    made.add_argument("--profile", help="of the sweep (default: that of its latest run)")
-    made.add_argument("--format", choices=("pdf", "md"), default="pdf", help="default: %(default)s")
-    add_tracking_option(made)
-    made.add_argument(
-        "--figure",
-        type=Path,
-        metavar="FILE",
-        help="compare: draw both sweeps' accuracy and differences to the baseline into FILE (.svg, .png or .pdf); the "
-        "Markdown shows it by its path from the working folder",
-    )
-    made.add_argument("--out", type=Path, metavar="DIR", help=f"default: {REPORTS}")
-    return made
+@click.command(epilog="python -m study.report compare A B sets two sweeps side by side; see its --help")
+@click.argument("name", metavar="SWEEP")
+@click.option("--profile", metavar="P", help="of the sweep [that of its latest run]")
+@click.option("--format", "kind", type=click.Choice(["pdf", "md"]), default="pdf", show_default=True)
+@click.option("--out", type=Path, default=HERE.reports, metavar="DIR", show_default=True)
+@tracking_option()
+def report(name: str, profile: str | None, kind: str, out: Path, tracking: str) -> int:
+    """Write the report of SWEEP from what MLflow holds: PDF, figures, numbers and the tidy table.
+
+    With --format md, print the report without figures as Markdown.
+    """
+    tracker = resolve_name("study.tracking.tracker:Tracker")(tracking)
+    if kind == "md":
+        print(resolve_name("study.report.build:report_as_markdown")(tracker, name, profile), end="")
+    else:
+        print(resolve_name("study.report.build:publish")(tracker, name, profile, out))
+    return 0
+
+
+@click.command
+@click.argument("first", metavar="A")
+@click.argument("second", metavar="B")
+@click.option(
+    "--figure",
+    type=Path,
+    metavar="FILE",
+    help="draw accuracy and differences to the baseline of both sweeps into FILE (.svg, .png or .pdf); the Markdown "
+    "shows it by its path from the working folder",
+)
+@tracking_option()
+def compare(first: str, second: str, figure: Path | None, tracking: str) -> int:
+    """Set two sweeps side by side, as Markdown on stdout.
+
+    A and B: each a report.json, a folder that holds one, or NAME[:PROFILE][@URI] of a sweep in MLflow.
+    """
+    print(resolve_name("study.report.build:side_by_side")(first, second, tracking, figure), end="")
+    return 0
 
 
 def main(args: Sequence[str]) -> int:
     """Run the command and return its exit code."""
-    options = parser().parse(args)
-    name, *rest = options.words
-    if len(rest) != (2 if name == "compare" else 0):
-        raise BadInputError(
-            f"'{' '.join(options.words)}' names {len(options.words)} things; give one sweep, or: compare A B"
-        )
-    if name == "compare":
-        for option, where in (("profile", "within a name: heads:smoke"), ("out", "with --figure FILE or > FILE")):
-            if getattr(options, option) is not None:
-                raise BadInputError(f"compare takes no --{option}; give it {where}")
-    elif options.figure:
-        raise BadInputError(f"--figure {options.figure} is for compare A B; a report has its own in DIR/SWEEP/figures")
-    # --help is answered without the libraries that only a report needs.
-    from study.report import build  # noqa: PLC0415
-    from study.tracking.tracker import Tracker  # noqa: PLC0415
-
-    if name == "compare":
-        print(build.side_by_side(rest[0], rest[1], options.tracking, options.figure), end="")
-    elif options.format == "md":
-        print(build.report_as_markdown(Tracker(options.tracking), name, options.profile), end="")
-    else:
-        print(build.publish(Tracker(options.tracking), name, options.profile, options.out or REPORTS))
-    return 0
+    return invoke(report, args, "study.report", {"compare": compare})
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from pathlib import Path
 import typst
 
 from study.atomic import write_atomic
-from study.config.workspace import REPORTS
+from study.config.workspace import HERE
 from study.errors import BadInputError, masked
 from study.figures.style import METADATA, save, write
 from study.report.comparison import compare
@@ -28,7 +28,7 @@ from study.tracking.variants import read_variants
 TEMPLATE = Path(__file__).with_name("report.typ")
 
 
-def build_report(record: SweepRecord, folder: Path = REPORTS) -> Path:
+def build_report(record: SweepRecord, folder: Path = HERE.reports) -> Path:
     """Write `<folder>/<sweep>.pdf` and, under `<folder>/<sweep>/`, report.json, curves.parquet and figures/.
 
     The same record gives the same bytes. Works for a sweep with unfinished cells, and says so on its first page.

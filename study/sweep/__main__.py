@@ -7,176 +7,118 @@ python -m study.sweep heads --data data/imported/scenes
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
+import random
+import signal
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from pkgutil import resolve_name  # the work is imported when it begins: --help and --dry-run need none of it
 
-from study.config.heads import HEADS
-from study.config.paper import parameter_counts
+import click
+
 from study.console.interrupts import stoppable
-from study.console.options import Parser, run, typed
+from study.console.options import invoke, run, tracking_option
 from study.errors import BadInputError
-from study.stages import Cost, cell_cost, duration_text, size_text, total
-from study.sweep.options import add_plan_options, add_run_options, check_run_options
-from study.sweep.plan import Plan, given_plan, look_up
+from study.sweep import options
+from study.sweep.dry_run import dry_run
+from study.sweep.plan import Plan
 
-if TYPE_CHECKING:
-    from study.tracking.tracker import Tracker
-
-
-# --- the command ----------------------------------------------------------------------------------------------------
+no_report = click.option("--no-report", is_flag=True, help="stop when the cells are finished")
 
 
-def parser() -> Parser:
-    """The command line."""
-    made = Parser(
-        prog="study.sweep",
-        usage="python -m study.sweep NAME [--profile P] [--dry-run] [--group.setting VALUE ...]\n"
-        "       python -m study.sweep status NAME ...    what is done, what runs where, what is left\n"
-        "       python -m study.sweep verify NAME ...    compute a finished cell again and compare\n"
-        "       python -m study.sweep train NAME ...     train where there is no tracker; results become folders",
-        description="Run a sweep to its report. Finished cells never run again; a killed sweep goes on.",
-        epilog="In brackets: the value where the profile names no other.\n"
-        "Example: python -m study.sweep heads --profile smoke --heads '[rec,full]' --encoder.epochs 50",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    add_plan_options(made)
-    made.add_argument("--dry-run", action="store_true", help="show what would run, what is done, and what it costs")
-    made.add_argument("--json", action="store_true", help="with --dry-run: one JSON object on stdout")
-    add_run_options(made)
-    made.add_argument(
-        "--import-results",
-        type=Path,
-        metavar="DIR",
-        help="train nothing: commit what study.sweep train has left in DIR",
-    )
-    made.add_argument("--no-report", action="store_true", help="stop when the cells are finished")
-    return made
+@click.command(
+    options_metavar="[--profile P] [--dry-run] [--group.setting V ...]",
+    epilog="""\b
+Further commands, each with its own --help:
+  status NAME      what is done, what runs where, what is left
+  verify NAME      compute a finished cell again and compare
+  train NAME       train where there is no tracker; results become folders
+  import NAME DIR  commit the results of train to MLflow
+
+In brackets: the value where the profile names no other.
+Example: python -m study.sweep heads --profile smoke --heads '[rec, full]' --encoder.epochs 50""",
+)
+@options.plan_options()
+@click.option("--dry-run", "show_only", is_flag=True, help="show what would run, what is done, and what it costs")
+@click.option("--json", "as_json", is_flag=True, help="with --dry-run: one JSON object on stdout")
+@options.run_options()
+@no_report
+@click.pass_obj
+def sweep(
+    command: str, *, plan: Plan, run_options: options.RunOptions, show_only: bool, as_json: bool, no_report: bool
+) -> int:
+    """Run the sweep NAME to its report. Finished cells never run again; a killed sweep goes on."""
+    if show_only:
+        return dry_run(plan, run_options.tracking, as_json=as_json)
+    if as_json:
+        raise BadInputError("--json goes with --dry-run; add --dry-run")
+    execute = resolve_name("study.sweep.run:execute")
+    return stoppable(lambda: execute(plan, run_options, command, report=not no_report), command)
+
+
+@click.command
+@options.plan_options()
+@tracking_option()
+@click.option("--json", "as_json", is_flag=True, help="one JSON object on stdout")
+def status(*, plan: Plan, tracking: str, as_json: bool) -> int:
+    """Show what of the sweep NAME is finished, what runs where, and what is left. Give the settings of the sweep."""
+    return int(resolve_name("study.sweep.status:show_status")(plan, tracking, as_json=as_json))
+
+
+@click.command
+@options.plan_options()
+@click.option("--cell", metavar="CELL", help="label or key of a finished cell, as --dry-run shows them [any]")
+@click.option("--seed", type=int, metavar="N", help="draws the cell [any]")
+@tracking_option()
+def verify(*, plan: Plan, cell: str | None, seed: int | None, tracking: str) -> int:
+    """Compute a finished cell of the sweep NAME again; compare curves, weights and predictions byte for byte."""
+    draw = random.randrange(10**6) if seed is None else seed  # noqa: S311 - no secret
+    return int(resolve_name("study.sweep.verify:verify")(plan, tracking, cell, draw))
+
+
+@click.command
+@options.plan_options()
+@click.option("--out", type=Path, required=True, metavar="DIR", help="where each result becomes a folder")
+@click.option(
+    "--limit-seconds", type=click.FloatRange(min=0, min_open=True), metavar="S", help="stop by then [go on to the end]"
+)
+@options.device
+@options.threads
+@click.pass_obj
+def train(command: str, *, plan: Plan, out: Path, limit_seconds: float | None, device: str, threads: int) -> int:
+    """Train the cells of the sweep NAME into a folder, without MLflow, Optuna and the simulator.
+
+    Finished cells never run again; a stopped command goes on. Exit code 0: all cells are there; 1: cells failed; 75:
+    cells are left, the same command goes on.
+    """
+    options.check_device(device)
+    options.check_installed()
+    train_cells = resolve_name("study.sweep.train:train")
+    signal.setitimer(signal.ITIMER_REAL, limit_seconds or 0)
+    try:
+        return stoppable(lambda: train_cells(plan, out, device, threads), command)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+
+
+@click.command
+@options.plan_options()
+@click.argument("folder", metavar="DIR", type=Path)
+@tracking_option()
+@options.wait
+@no_report
+@click.pass_obj
+def import_results(command: str, *, plan: Plan, folder: Path, tracking: str, wait: bool, no_report: bool) -> int:
+    """Commit what `study.sweep train NAME --out DIR` has left in DIR to MLflow, and write the report."""
+    import_folder = resolve_name("study.sweep.offline_results:import_folder")
+    return stoppable(lambda: import_folder(plan, folder, tracking, wait=wait, report=not no_report), command)
+
+
+COMMANDS = {"status": status, "verify": verify, "train": train, "import": import_results}
 
 
 def main(args: Sequence[str]) -> int:
     """Run the command and return its exit code."""
-    if args[:1] == ["status"]:
-        from study.sweep.status import main as status  # noqa: PLC0415
-
-        return status(args[1:])
-    if args[:1] == ["train"]:
-        from study.sweep.train import main as train  # noqa: PLC0415
-
-        return train(args[1:])
-    if args[:1] == ["verify"]:
-        from study.sweep.verify import main as verify  # noqa: PLC0415
-
-        return verify(args[1:])
-    options = parser().parse(args)
-    plan = given_plan(options)
-    if options.json and not options.dry_run:
-        raise BadInputError("--json goes with --dry-run; add --dry-run")
-    check_run_options(options)
-    if options.dry_run:
-        return dry_run(plan, options.tracking, as_json=options.json)
-    command = typed("study.sweep", args)
-    run_plan = import_results if options.import_results else execute
-    return stoppable(lambda: run_plan(plan, options, command), command)
-
-
-# --- dry run --------------------------------------------------------------------------------------------------------
-
-
-def dry_run(plan: Plan, tracking: str, *, as_json: bool) -> int:
-    """Print the plan, what of it is finished, and what the rest costs."""
-    tracker = look_up(tracking)
-    done = tracker.finished(list(plan.cells)) if tracker else {}
-    costs = [
-        cell_cost(plan.settings, cell, plan.grid.policy_seeds) for key, cell in plan.cells.items() if key not in done
-    ]
-    ready = (plan.frames / "manifest.json").is_file()
-    data = Cost(0, 0) if ready or not costs else plan.data_cost
-    whole = total([data, *costs])
-    frames = plan.settings.frames
-    facts = {
-        "sweep": plan.grid.name,
-        "profile": plan.profile,
-        "cells": [
-            {
-                "key": key,
-                "heads": cell.heads,
-                "fraction": cell.fraction,
-                "encoder_seed": cell.encoder_seed,
-                "status": "finished" if key in done else "waiting",
-            }
-            for key, cell in plan.cells.items()
-        ],
-        "policy_seeds": plan.grid.policy_seeds,
-        "parameters": parameter_counts(),
-        "frames": {"encoder": frames.encoder, "policy": frames.policy},
-        "seconds": round(whole.seconds, 1),
-        "bytes": whole.bytes,
-    }
-    if as_json:
-        print(json.dumps(facts))
-        return 0
-    print(f"{plan.grid.name} ({plan.profile}): {plan.grid.title}\n")
-    for key, cell in plan.cells.items():
-        own = cell_cost(plan.settings, cell, plan.grid.policy_seeds)
-        state = "finished" if key in done else f"waiting, about {duration_text(own.seconds)}"
-        print(f"  {cell.label:<22} {key}  {plan.grid.policy_seeds} policies  {state}")
-    counts = parameter_counts()
-    heads = ", ".join(f"{head} head {counts[head]:,}" for head in HEADS)
-    where = "there already" if ready else f"about {duration_text(data.seconds)} to make"
-    print(f"\nparameters  encoder {counts['encoder']:,}, {heads}")
-    print(f"frames      {frames.encoder:,} for encoders, {frames.policy:,} for policies; {where}")
-    print(f"disk        about {size_text(whole.bytes)}")
-    print(f"time        about {duration_text(whole.seconds)} on 2 CPU cores")
-    return 0
-
-
-# --- the run --------------------------------------------------------------------------------------------------------
-
-
-def execute(plan: Plan, options: argparse.Namespace, command: str) -> int:
-    """Run what is not finished, then write the report."""
-    # Imported here, so that --help and --dry-run need none of it.
-    from study.sweep.run import hold_store, report_failed, run_cells  # noqa: PLC0415
-    from study.tracking.tracker import Tracker  # noqa: PLC0415
-
-    with hold_store(options.tracking, plan.grid.name, wait=options.wait):
-        tracker = Tracker(options.tracking)
-        failed = run_cells(plan, options, tracker)
-        if not options.no_report:
-            print("writing the report", file=sys.stderr)
-            print(f"report: {_publish(plan, tracker)}", file=sys.stderr)
-    return report_failed(plan, failed, command)
-
-
-def import_results(plan: Plan, options: argparse.Namespace, command: str) -> int:
-    """Commit what was trained elsewhere; then write the report, or say which cells are missing."""
-    from study.sweep.offline_results import planned_results, take_in  # noqa: PLC0415 - as above
-    from study.sweep.run import hold_store  # noqa: PLC0415
-
-    keys = planned_results(plan, options.import_results)
-    from study.tracking.tracker import Tracker  # noqa: PLC0415
-
-    with hold_store(options.tracking, plan.grid.name, wait=options.wait):
-        tracker = Tracker(options.tracking)
-        missing = take_in(plan, options.import_results, keys, tracker)
-        for key in missing:
-            print(f"missing: {plan.cells[key].label} ({key})", file=sys.stderr)
-        if missing:
-            here = command.replace(f"--import-results {options.import_results}", "").strip()
-            print(f"Import them, too, or train them here: {here}", file=sys.stderr)
-        elif not options.no_report:
-            print(f"report: {_publish(plan, tracker)}", file=sys.stderr)
-    return 0
-
-
-def _publish(plan: Plan, tracker: Tracker) -> Path:
-    from study.report.build import publish  # noqa: PLC0415
-
-    return publish(tracker, plan.grid.name, plan.profile, Path("reports"))
+    return invoke(sweep, args, "study.sweep", COMMANDS)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import os
 import shutil
 import threading
@@ -14,6 +13,7 @@ from typing import Any, ParamSpec, Self, TypeVar
 from tenacity import RetryCallState, Retrying, retry_if_exception_type, stop_after_delay, wait_fixed
 
 from study.cell.flow import cell_flow, product_folders
+from study.config.workspace import Workspace
 from study.console.display import Display
 from study.console.interrupts import check_stopped
 from study.engine.flows import Listener
@@ -22,6 +22,7 @@ from study.engine.trials import Trials
 from study.errors import BadInputError, masked
 from study.results.cell_result import CellResult
 from study.stages import Flow
+from study.sweep.options import RunOptions
 from study.sweep.plan import Plan, cell_jobs
 from study.tracking.cell_run import CellRun
 from study.tracking.experiment import SQLITE, TrackerLostError
@@ -41,7 +42,7 @@ class Committing:
     def __init__(
         self,
         plan: Plan,
-        options: argparse.Namespace,
+        options: RunOptions,
         tracker: Tracker,
         sweep_run: str,
         order: Collection[str],
@@ -54,7 +55,9 @@ class Committing:
         self._failed: dict[str, str] = {}
         self._one_share = accelerated
         labels = {key: cell.label for key, cell in plan.cells.items()}
-        self._trials = Trials(store_folder(options.tracking) / "optuna.db", plan.study_name, labels, order)
+        self._trials = Trials(
+            store_folder(plan.workspace, options.tracking) / "optuna.db", plan.study_name, labels, order
+        )
         # A file that cannot be written is no matter of seconds; a server that was restarted is.
         self._patience = 0.0 if tracker.experiment.is_file else PATIENCE
 
@@ -169,8 +172,8 @@ def _score(result: CellResult) -> float:
     return float(final[final["epoch"] == final["epoch"].max()]["value"].mean())
 
 
-def store_folder(tracking: str) -> Path:
+def store_folder(workspace: Workspace, tracking: str) -> Path:
     """Return where the lock and Optuna's file of a tracking store lie: beside a database file, else in mlruns/."""
     if tracking.startswith(SQLITE):
         return Path(tracking.removeprefix(SQLITE).partition("?")[0]).parent
-    return Path("mlruns")
+    return workspace.mlruns

@@ -6,32 +6,46 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from study.compute.provenance import provenance
+from study.driving.driver import export_driver
 from study.errors import BadInputError
 from study.results.cell_result import CellResult, load_results
 from study.sweep.plan import Plan
+from study.sweep.run import hold_store, open_sweep, write_report
+from study.tracking.tracker import Tracker
 
-if TYPE_CHECKING:  # what is wrong with the results is told without MLflow
-    from study.tracking.tracker import Tracker
+
+def import_folder(plan: Plan, folder: Path, tracking: str, *, wait: bool, report: bool) -> int:
+    """Commit what was trained elsewhere; then write the report, or say which cells are missing. Returns exit code 0."""
+    keys = planned_results(plan, folder)
+    with hold_store(plan, tracking, wait=wait):
+        tracker = Tracker(tracking)
+        missing = take_in(plan, folder, keys, tracker)
+        for key in missing:
+            _say(f"missing: {plan.cells[key].label} ({key})")
+        if missing:
+            _say(f"Import them, too, or train them here: {plan.command}")
+        elif report:
+            write_report(plan, tracker)
+    return 0
 
 
 def planned_results(plan: Plan, folder: Path) -> list[str]:
-    """Keys of the results in `folder` that the plan has; all are checked, those of other plans are named and left out.
+    """Return the keys of the results in `folder` that the plan has; name and leave out those of other plans.
 
     Raises BadInputError when one is not whole, or when none is of this plan.
     """
-    found = {result.key: result.cell for result in load_results(folder)}
-    foreign = [f"{cell.label} ({key})" for key, cell in found.items() if key not in plan.cells]
-    if len(foreign) == len(found):
+    cells = {result.key: result.cell for result in load_results(folder)}
+    foreign = [f"{cell.label} ({key})" for key, cell in cells.items() if key not in plan.cells]
+    if len(foreign) == len(cells):
         raise BadInputError(
             f"{folder} holds {', '.join(foreign)}, and none of them is planned in {plan.grid.name} ({plan.profile}); "
             "give the --profile and the settings that they were trained with"
         )
     if foreign:
         _say(f"left out, since this sweep does not plan them: {', '.join(foreign)}")
-    return [key for key in plan.cells if key in found]
+    return [key for key in plan.cells if key in cells]
 
 
 def take_in(plan: Plan, folder: Path, keys: Sequence[str], tracker: Tracker) -> list[str]:
@@ -39,13 +53,9 @@ def take_in(plan: Plan, folder: Path, keys: Sequence[str], tracker: Tracker) -> 
 
     Raises BadInputError when the frames' manifest beside the results is not theirs.
     """
-    from study.driving.driver import export_driver  # noqa: PLC0415 - torch, which a refusal does not need
-
     data = _manifest(plan, folder)
     done = tracker.reader.finished(list(plan.cells))
-    planned = (plan.grid, plan.profile, plan.settings, plan.cells)
-    origin = provenance() | {"command": plan.command}
-    sweep_run = tracker.open_sweep(*planned, data, origin)
+    sweep_run = open_sweep(plan, data, tracker)
     missing = list(plan.cells)
     try:
         for key in keys:
@@ -72,7 +82,7 @@ def _say(line: str) -> None:
 
 
 def _manifest(plan: Plan, folder: Path) -> dict[str, Any]:
-    """The manifest of the plan's frames, from beside the results or from here; empty where there is neither."""
+    """Return the manifest of the plan's frames, from beside the results or from here; empty where there is neither."""
     key = plan.frames.name
     data: dict[str, Any] = {}
     for path in (folder / f"frames-{key}.json", plan.frames / "manifest.json"):
@@ -85,6 +95,4 @@ def _manifest(plan: Plan, folder: Path) -> dict[str, Any]:
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise BadInputError(f"{path} is no manifest of a frame store ({error!r}); copy it again") from error
         raise BadInputError(f"{path} is the manifest of other frames, {data['key']}; copy it again")
-    if plan.imported:
-        data["writers"] = plan.imported.writers  # a report must not call these drives our town's
     return data

@@ -2,92 +2,121 @@
 
 from __future__ import annotations
 
-import argparse
+import importlib.util
+import pkgutil
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from study.config.files import named_files
+import click
+
 from study.config.grid import Grid
 from study.config.settings import StudySettings
-from study.config.workspace import SWEEPS
-from study.console.options import (
-    GRID_OPTIONS,
-    Parser,
-    add_options,
-    add_tracking_option,
-)
+from study.console.options import Decorator, bundled, nested, profile_option, settings_options, tracking_option
 from study.engine.cluster_options import check_cluster
 from study.errors import BadInputError
+from study.sweep.plan import Plan, make_plan
+
+GRID_OPTIONS = ("heads", "fractions", "encoder_seeds", "policy_seeds", "baseline", "ceiling")
 
 
-def add_plan_options(parser: Parser) -> None:
-    """What every command takes that works on a plan."""
-    parser.add_argument(
-        "sweep",
-        metavar="NAME",
-        help=f"name of a sweep file in {SWEEPS}/: {', '.join(named_files(SWEEPS)) or 'none here'}",
-    )
-    parser.add_argument(
-        "--profile",
-        default="laptop",
-        help=f"{', '.join(named_files(SWEEPS / 'profiles'))} (default: laptop)",
-    )
-    parser.add_argument(
-        "--data", type=Path, metavar="FOLDER", help="imported drives (study.data import); default: our town's"
-    )
-    add_options(parser, Grid, GRID_OPTIONS)
-    add_options(parser, StudySettings)
+def _plan(name: str, profile: str, data: Path | None, **values: Any) -> Plan:
+    grid = nested({option: values.pop(option) for option in GRID_OPTIONS})
+    return make_plan(name, profile, nested(values), grid, data)
 
 
-def add_machine_options(parser: Parser) -> None:
-    """What every command takes that trains cells."""
-    parser.add_argument("--device", default="auto", help="cpu, cuda, cuda:1, ... (default: cuda where there is one)")
-    parser.add_argument(
-        "--threads",
-        type=int,
-        default=1,
-        metavar="N",
-        help="threads each task computes with, for a lone large encoder; the last digits depend on it (default: 1)",
+def plan_options() -> Decorator:
+    """Take the name of a sweep and everything that changes its plan; the command gets the `plan`."""
+    return bundled(
+        "plan",
+        _plan,
+        click.argument("name"),
+        profile_option(),
+        click.option(
+            "--data", type=Path, metavar="FOLDER", help="imported drives (study.data import) [those of our town]"
+        ),
+        *settings_options(Grid, GRID_OPTIONS),
+        *settings_options(StudySettings),
     )
 
 
-def check_machine(options: argparse.Namespace) -> None:
-    """Raise BadInputError for a device that is not there, or no threads."""
-    if options.threads < 1:
-        raise BadInputError(f"--threads is {options.threads}; it must be 1 or more")
-    if options.device not in {"auto", "cpu"}:
-        from study.compute.device import check_device  # noqa: PLC0415 - loads torch, which only a named GPU needs here
+@dataclass(frozen=True)
+class RunOptions:
+    """How to train the cells of a plan, and where to commit them. Raises BadInputError for what cannot be used."""
 
-        check_device(options.device)
+    tracking: str
+    device: str = "auto"
+    threads: int = 1
+    workers: int | None = None
+    cluster: str | None = None
+    certificates: Path | None = None
+    wait: bool = False
+    retry_failed: bool = False
+
+    def __post_init__(self) -> None:
+        if self.cluster and self.workers is not None:
+            raise BadInputError(
+                "--workers counts processes on this machine; a cluster has its own: leave one of them out"
+            )
+        if self.certificates and not (self.cluster or "").startswith("tls://"):
+            raise BadInputError("--certificates goes with --cluster tls://host:port")
+        if self.cluster:
+            check_cluster(self.cluster, self.certificates)
+        else:
+            check_device(self.device)
 
 
-def add_run_options(parser: Parser) -> None:
-    """Add the options of a command that trains the cells of a plan and commits them."""
-    parser.add_argument(
-        "--workers", type=int, metavar="N", help="processes on this machine, one task each (default: all cores)"
+def check_device(name: str) -> None:
+    """Raise BadInputError for a device that this machine lacks."""
+    if name not in {"auto", "cpu"}:  # torch is loaded for a named GPU only
+        pkgutil.resolve_name("study.compute.device:check_device")(name)
+
+
+device = click.option("--device", default="auto", metavar="D", help="cpu, cuda, cuda:1, ... [cuda where there is one]")
+threads = click.option(
+    "--threads",
+    type=click.IntRange(min=1),
+    default=1,
+    metavar="N",
+    help="threads of each task, for a lone large encoder; the last digits of results depend on it [1]",
+)
+wait = click.option("--wait", is_flag=True, help="wait while another sweep runs on this tracking store")
+
+
+def run_options() -> Decorator:
+    """Choose how cells are trained and committed; the command gets `run_options`."""
+    return bundled(
+        "run_options",
+        RunOptions,
+        click.option(
+            "--workers",
+            type=click.IntRange(min=1),
+            metavar="N",
+            help="processes on this machine, one task each [cores]",
+        ),
+        click.option(
+            "--cluster",
+            metavar="WHERE",
+            help="run on a Dask cluster: its scheduler's address (tls://host:8786), or a YAML file for a batch system",
+        ),
+        click.option(
+            "--certificates",
+            type=Path,
+            metavar="DIR",
+            help="with tls://: folder with ca.pem, cert.pem and key.pem",
+        ),
+        device,
+        threads,
+        tracking_option(),
+        wait,
+        click.option("--retry-failed", is_flag=True, help="try cells again that are listed as failed"),
     )
-    parser.add_argument(
-        "--cluster",
-        metavar="WHERE",
-        help="run on a Dask cluster: its scheduler's address (tls://host:8786), or a YAML file for a batch system",
-    )
-    parser.add_argument(
-        "--certificates", type=Path, metavar="DIR", help="with tls://: folder with ca.pem, cert.pem and key.pem"
-    )
-    add_machine_options(parser)
-    add_tracking_option(parser)
-    parser.add_argument("--wait", action="store_true", help="wait while another sweep runs on this tracking store")
-    parser.add_argument("--retry-failed", action="store_true", help="try cells again that are listed as failed")
 
 
-def check_run_options(options: argparse.Namespace) -> None:
-    """Raise BadInputError for options of `add_run_options` that cannot be used."""
-    if options.workers is not None and options.workers < 1:
-        raise BadInputError(f"--workers is {options.workers}; it must be 1 or more")
-    if options.cluster and options.workers is not None:
-        raise BadInputError("--workers counts processes on this machine; a cluster has its own: leave one of them out")
-    if options.certificates and not (options.cluster or "").startswith("tls://"):
-        raise BadInputError("--certificates goes with --cluster tls://host:port")
-    if options.cluster:
-        check_cluster(options.cluster, options.certificates)
-    if options.threads < 1 or (options.device not in {"auto", "cpu"} and not options.cluster):
-        check_machine(options)
+def check_installed() -> None:
+    """Raise BadInputError when the machine lacks what training needs, before hours are spent on the data."""
+    for name in ("torch", "lightning", "pandas", "pyarrow", "cv2", "safetensors", "filelock"):
+        if importlib.util.find_spec(name) is None:
+            raise BadInputError(
+                f"{name} is not installed here; bring its wheel along (WHEELS in benchmarks/paper_scale.sh)"
+            )

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -16,8 +15,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from study.compute.provenance import cores, provenance
-from study.config.workspace import DATA
-from study.console.display import Display
+from study.config.workspace import Workspace
 from study.data.card import card_files, source_drives
 from study.data.frames import open_frames
 from study.data.prepare import data_flow, describe_data
@@ -28,41 +26,50 @@ from study.engine.inline import InlineEngine
 from study.engine.local import local_engine, visible_gpus
 from study.engine.tasks import Engine
 from study.errors import EXIT_FAILED, BadInputError, masked
-from study.stages import DESCRIBE, Batch, Flow, Task, cell_cost
+from study.report.build import publish
+from study.stages import DESCRIBE, Batch, Flow, Task
 from study.sweep.committing import Committing, store_folder
-from study.sweep.plan import Plan
+from study.sweep.options import RunOptions
+from study.sweep.plan import Plan, plan_display
 from study.tracking.tracker import Tracker
 
 
-def run_cells(plan: Plan, options: argparse.Namespace, tracker: Tracker) -> dict[str, str]:
+def execute(plan: Plan, options: RunOptions, command: str, *, report: bool) -> int:
+    """Run what is not finished, then write the report unless told not to. Returns the exit code."""
+    with hold_store(plan, options.tracking, wait=options.wait):
+        tracker = Tracker(options.tracking)
+        failed = run_cells(plan, options, tracker)
+        if report:
+            print("writing the report", file=sys.stderr)
+            write_report(plan, tracker)
+    for key, reason in failed.items():
+        print(f"failed: {plan.cells[key].label} ({key}): {reason.strip()}", file=sys.stderr)
+    if failed:
+        print(f"Once the cause is gone: {command.removesuffix(' --retry-failed')} --retry-failed", file=sys.stderr)
+    return EXIT_FAILED if failed else 0
+
+
+def write_report(plan: Plan, tracker: Tracker) -> None:
+    """Write the report of a plan's sweep, and print where it is."""
+    print(f"report: {publish(tracker, plan.grid.name, plan.profile, plan.workspace.reports)}", file=sys.stderr)
+
+
+def run_cells(plan: Plan, options: RunOptions, tracker: Tracker) -> dict[str, str]:
     """Train what is not finished, until every cell is finished or has failed. Returns the failed, with reasons."""
     done = tracker.reader.finished(list(plan.cells))
     given_up = {} if options.retry_failed else tracker.reader.given_up(set(plan.cells) - set(done))
     waiting = [key for key in plan.cells if key not in done and key not in given_up]
-    costs = {key: cell_cost(plan.settings, plan.cells[key], plan.grid.policy_seeds).seconds for key in waiting}
-    labels = {key: cell.label for key, cell in plan.cells.items()}
-    ready = (plan.frames / "manifest.json").is_file()
-    title = f"{plan.grid.name} ({plan.profile})"
-    order = sorted(waiting, key=lambda key: -costs[key])
+    order = sorted(waiting, key=lambda key: -plan.costs[key].seconds)
     with (
-        Display(
-            title,
-            costs | dict.fromkeys(given_up, 0.0),
-            labels,
-            0.0 if ready or not waiting else plan.data_cost.seconds,
-            plan.works,
-        ) as display,
-        temporary_folder(DATA),
-        start_engine(options) if waiting else InlineEngine() as engine,
+        plan_display(plan, waiting, given_up) as display,
+        temporary_folder(plan.workspace),
+        start_engine(plan, options) if waiting else InlineEngine() as engine,
     ):
         if waiting:
             data, card = run_flow(_data_flow(plan, engine), engine, display.data)
         else:
-            data, card = _describe_here(plan) if ready else ({}, {})
-        if plan.imported:
-            data["writers"] = plan.imported.writers  # a report must not call these drives our town's
-        origin = provenance() | {"command": plan.command}
-        sweep_run = tracker.open_sweep(plan.grid, plan.profile, plan.settings, plan.cells, data, origin)
+            data, card = _describe_here(plan) if plan.frames_ready else ({}, {})
+        sweep_run = open_sweep(plan, data, tracker)
         with Committing(plan, options, tracker, sweep_run, order, display, engine.gpus() > 0) as cells:
             with tempfile.TemporaryDirectory() as name:
                 files = [Path(name) / file for file in card]
@@ -75,30 +82,30 @@ def run_cells(plan: Plan, options: argparse.Namespace, tracker: Tracker) -> dict
             return given_up | cells.close()
 
 
-def report_failed(plan: Plan, failed: Mapping[str, str], command: str) -> int:
-    """Print the failed cells with their reasons and what can be done; returns the exit code."""
-    for key, reason in failed.items():
-        print(f"failed: {plan.cells[key].label} ({key}): {reason.strip()}", file=sys.stderr)
-    if failed:
-        print(f"Once the cause is gone: {command.removesuffix(' --retry-failed')} --retry-failed", file=sys.stderr)
-    return EXIT_FAILED if failed else 0
+def open_sweep(plan: Plan, data: dict[str, Any], tracker: Tracker) -> str:
+    """Open the sweep's run, with the manifest of its frames; returns the run's identifier."""
+    if plan.imported:
+        data = data | {"writers": plan.imported.writers}  # a report must not call these drives our town's
+    origin = provenance() | {"command": plan.command}
+    return tracker.open_sweep(plan.grid, plan.profile, plan.settings, plan.cells, data, origin)
 
 
-def start_engine(options: argparse.Namespace) -> DaskEngine | InlineEngine:
+def start_engine(plan: Plan, options: RunOptions) -> DaskEngine:
     """Start the engine that the options ask for."""
+    scratch = plan.workspace.tmp
     if options.cluster:
-        return cluster_engine(options.cluster, options.certificates)
+        return cluster_engine(options.cluster, options.certificates, scratch)
     workers = options.workers or max(1, cores() // options.threads)
-    return local_engine(workers, DATA / "tmp", visible_gpus(options.device))
+    return local_engine(workers, scratch, visible_gpus(options.device))
 
 
 @contextmanager
-def temporary_folder(root: Path) -> Iterator[None]:
-    """Have this process put its temporary files below `root`, where what a kill leaves is removed by the next sweep."""
-    folder = root / "tmp"
+def temporary_folder(workspace: Workspace) -> Iterator[None]:
+    """Have this process put its temporary files into the workspace, where the next sweep removes what a kill leaves."""
+    folder = workspace.tmp
     folder.mkdir(parents=True, exist_ok=True)
     before = tempfile.tempdir
-    lock = FileLock(root / ".in-use")
+    lock = FileLock(workspace.data / ".in-use")
     with suppress(Timeout):  # another sweep works here, and may need what it has there
         lock.acquire(blocking=False)
         _empty(folder)
@@ -119,20 +126,18 @@ def _empty(folder: Path) -> None:
 
 def _data_flow(plan: Plan, engine: Engine) -> Flow[Any]:
     """Make and describe the frames: here, with the engine's help, unless its workers have folders of their own."""
-    if _shares_folder(engine):
-        yield from data_flow(plan.settings, DATA, plan.imported)
-    task = Task(
-        DESCRIBE, describe_data, (plan.frames, plan.drives, plan.settings, plan.imported, plan.grid.head_modules)
-    )
-    (described,) = yield Batch([task])
+    if _shares_folder(plan.workspace.data, engine):
+        yield from data_flow(plan.settings, plan.workspace.data, plan.imported)
+    arguments = (plan.workspace.data, plan.settings, plan.imported, plan.grid.head_modules)
+    (described,) = yield Batch([Task(DESCRIBE, describe_data, arguments)])
     return described
 
 
-def _shares_folder(engine: Engine) -> bool:
+def _shares_folder(folder: Path, engine: Engine) -> bool:
     if not isinstance(engine, DaskEngine):
         return True
-    with tempfile.NamedTemporaryFile(dir=DATA, prefix=".shared-") as token:
-        return engine.workers_see(DATA / Path(token.name).name)
+    with tempfile.NamedTemporaryFile(dir=folder, prefix=".shared-") as token:
+        return engine.workers_see(folder / Path(token.name).name)
 
 
 def _describe_here(plan: Plan) -> tuple[dict[str, Any], dict[str, bytes]]:
@@ -142,12 +147,12 @@ def _describe_here(plan: Plan) -> tuple[dict[str, Any], dict[str, bytes]]:
 
 
 @contextmanager
-def hold_store(tracking: str, sweep: str, *, wait: bool) -> Iterator[None]:
+def hold_store(plan: Plan, tracking: str, *, wait: bool) -> Iterator[None]:
     """Hold a tracking store for one sweep at a time.
 
     Raises BadInputError that says who holds it, unless told to `wait`.
     """
-    folder = store_folder(tracking)
+    folder = store_folder(plan.workspace, tracking)
     folder.mkdir(parents=True, exist_ok=True)
     lock, holder = FileLock(folder / "sweep.lock"), folder / "sweep.json"
     try:
@@ -164,7 +169,7 @@ def hold_store(tracking: str, sweep: str, *, wait: bool) -> Iterator[None]:
         print(f"waiting for {who}, which runs on this store", file=sys.stderr)
         lock.acquire()
     try:
-        holder.write_text(json.dumps({"sweep": sweep, "process": os.getpid()}), encoding="utf-8")
+        holder.write_text(json.dumps({"sweep": plan.grid.name, "process": os.getpid()}), encoding="utf-8")
         yield
     finally:
         holder.unlink(missing_ok=True)

@@ -10,8 +10,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import os
-import platform
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -19,22 +17,19 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 from study.console.display import show_table
-from study.console.options import Parser, add_tracking_option
 from study.errors import masked
-from study.stages import CELL_STAGES, RESULT_S, STAGES, Work, cell_cost, duration_text, share_done
-from study.sweep.options import add_plan_options
-from study.sweep.plan import Plan, given_plan, look_up
+from study.stages import CELL_STAGES, RESULT_S, STAGES, duration_text, share_done
+from study.sweep.plan import Plan, look_up
 
 if TYPE_CHECKING:
     from study.tracking.reader import Attempt
 
 
-State = Literal["finished", "running", "silent", "dead", "waiting", "failed"]
+State = Literal["finished", "running", "silent", "waiting", "failed"]
 STATES: dict[State, str] = {  # with its style on a terminal
     "finished": "green",
     "running": "bold",
     "silent": "yellow",
-    "dead": "red",
     "waiting": "dim",
     "failed": "red",
 }
@@ -45,8 +40,8 @@ SILENT = 120.0  # [s] without a sign of life: several times what loading torch o
 class CellStatus:
     """Where a cell stands. Times in s: `since` 1970, `took` by the finished attempt, `quiet` without a sign of life.
 
-    `silent`: it says RUNNING and nothing has been heard for two minutes; `dead`: its process on this host is gone.
-    Both wait for a sweep to take them up again. `share`: of the cell's work that is done.
+    `silent`: it says RUNNING and nothing has been heard for two minutes; a sweep must take it up again. `share`: of the
+    cell's work that is done.
     """
 
     key: str
@@ -66,12 +61,12 @@ class CellStatus:
     reason: str = ""
 
 
-def cell_statuses(plan: Plan, attempts: Mapping[str, Sequence[Attempt]], now: float, host: str) -> list[CellStatus]:
-    """Where each cell of a plan stands at a time [s since 1970], seen from a host."""
-    return [_cell_status(plan, key, attempts.get(key, ()), now, host) for key in plan.cells]
+def cell_statuses(plan: Plan, attempts: Mapping[str, Sequence[Attempt]], now: float) -> list[CellStatus]:
+    """Return where each cell of a plan stands at a time [s since 1970]."""
+    return [_cell_status(plan, key, attempts.get(key, ()), now) for key in plan.cells]
 
 
-def _cell_status(plan: Plan, key: str, attempts: Sequence[Attempt], now: float, host: str) -> CellStatus:
+def _cell_status(plan: Plan, key: str, attempts: Sequence[Attempt], now: float) -> CellStatus:
     found = CellStatus(key, plan.cells[key].label, "waiting", len(attempts))
     done = next((attempt for attempt in attempts if attempt.status == "FINISHED"), None)
     if done is not None:
@@ -86,12 +81,9 @@ def _cell_status(plan: Plan, key: str, attempts: Sequence[Attempt], now: float, 
     tags = last.tags
     quiet = max(0.0, now - float(tags.get("alive", last.started)) / 1000)
     state: State = "silent" if quiet > SILENT else "running"
-    if tags.get("host") == host and not _runs(tags.get("process", "")):
-        state = "dead"
     stage, _, steps = tags.get("progress", "").partition(" ")
-    part, whole = (int(number) for number in steps.split("/")) if steps else (0, 1)
+    part, total = (int(number) for number in steps.split("/")) if steps else (0, 1)
     epochs = {"encoder": plan.settings.encoder.epochs, "policy": plan.settings.policy.epochs}.get(stage, 0)
-    work = Work(plan.settings, plan.cells[key], plan.grid.policy_seeds)
     return dataclasses.replace(
         found,
         state=state,
@@ -101,34 +93,24 @@ def _cell_status(plan: Plan, key: str, attempts: Sequence[Attempt], now: float, 
         since=last.started / 1000,
         quiet=quiet,
         stage=stage,
-        epoch=math.ceil(part * epochs / whole),
+        epoch=math.ceil(part * epochs / total),
         epochs=epochs,
-        share=share_done(CELL_STAGES, work, STAGES[stage], part / whole) if stage in STAGES else 0.0,
+        share=share_done(CELL_STAGES, plan.works[key], STAGES[stage], part / total) if stage in STAGES else 0.0,
     )
 
 
 def _first(reason: str) -> str:
-    """The line of a reason that says most: of a traceback the last."""
+    """Return the line of a reason that says most: of a traceback the last."""
     lines = reason.strip().splitlines() or ["unknown"]
     return lines[-1] if lines[0].startswith("Traceback") else lines[0]
 
 
-def _runs(process: str) -> bool:
-    try:
-        os.kill(int(process), 0)
-    except ProcessLookupError:
-        return False
-    except (PermissionError, ValueError, OverflowError):  # another user's, or nobody has said which
-        return True
-    return True
-
-
 def seconds_left(plan: Plan, cells: Sequence[CellStatus], now: float, *, frames_ready: bool) -> float:
-    """Estimate of what is left: expected costs, times what the cells so far have shown them to be wrong by.
+    """Estimate the time that is left [s]: expected costs, times what the cells so far have shown them to be wrong by.
 
     Failed cells are not counted, since nobody takes them up by themselves.
     """
-    costs = {key: cell_cost(plan.settings, cell, plan.grid.policy_seeds).seconds for key, cell in plan.cells.items()}
+    costs = {key: cost.seconds for key, cost in plan.costs.items()}
     expected = measured = left = 0.0
     for cell in cells:
         if cell.took is not None:
@@ -143,55 +125,40 @@ def seconds_left(plan: Plan, cells: Sequence[CellStatus], now: float, *, frames_
     return data + left / at_a_time * (measured / expected if expected else 1.0)
 
 
-# --- the command ----------------------------------------------------------------------------------------------------
-
-
-def main(args: Sequence[str]) -> int:
-    """Run the command and return its exit code."""
-    made = Parser(
-        prog="study.sweep status",
-        usage="python -m study.sweep status NAME [--profile P] [--tracking URI] [--json] [--group.setting VALUE ...]",
-        description="What of a sweep is finished, what runs where, what is left. Settings must be those of the sweep.",
-    )
-    add_plan_options(made)
-    add_tracking_option(made)
-    made.add_argument("--json", action="store_true", help="one JSON object on stdout")
-    options = made.parse(args)
-    plan = given_plan(options)
-    tracker = look_up(options.tracking)
-    attempts = tracker.attempts(plan.cells) if tracker else {}
+def show_status(plan: Plan, tracking: str, *, as_json: bool) -> int:
+    """Print where the cells of a plan stand, and return exit code 0."""
+    reader = look_up(tracking)
     now = time.time()
-    cells = cell_statuses(plan, attempts, now, platform.node())
-    ready = (plan.frames / "manifest.json").is_file()
-    left = seconds_left(plan, cells, now, frames_ready=ready)
-    if options.json:
+    cells = cell_statuses(plan, reader.attempts(plan.cells) if reader else {}, now)
+    left = seconds_left(plan, cells, now, frames_ready=plan.frames_ready)
+    if as_json:
         facts = {
             "sweep": plan.grid.name,
             "profile": plan.profile,
-            "tracking": masked(options.tracking),
+            "tracking": masked(tracking),
             "cells": [dataclasses.asdict(cell) for cell in cells],
             "seconds_left": round(left, 1),
         }
         print(json.dumps(facts))
     else:
-        _show(plan, cells, left, now, frames_ready=ready)
+        _show(plan, cells, left, now)
     return 0
 
 
-def _show(plan: Plan, cells: Sequence[CellStatus], left: float, now: float, *, frames_ready: bool) -> None:
+def _show(plan: Plan, cells: Sequence[CellStatus], left: float, now: float) -> None:
     counts = Counter(cell.state for cell in cells)
     parts = [f"{counts[state]} {state}" for state in STATES if state != "finished" and counts[state]]
     parts = [f"{plan.grid.name} ({plan.profile}): {counts['finished']} of {len(cells)} cells finished", *parts]
     if left:
         parts.append(f"about {duration_text(left)} left")
     print(", ".join(parts))
-    if not frames_ready and counts["finished"] < len(cells):
+    if not plan.frames_ready and counts["finished"] < len(cells):
         print("frames are not made yet")
     show_table([_row(cell, now) for cell in cells], [STATES[cell.state] for cell in cells])
 
 
 def _row(cell: CellStatus, now: float) -> tuple[str, str, str, str, str]:
-    """Label, state, how far, since when, where."""
+    """Return label, state, how far, since when, where."""
     how, since, where = "", "", ""
     if cell.state == "finished" and cell.took is not None:
         how = f"in {duration_text(cell.took)}"

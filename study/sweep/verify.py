@@ -1,4 +1,4 @@
-"""A finished cell computed again in a folder of its own, and compared with what MLflow holds, byte for byte.
+"""Compute a finished cell again in a folder of its own, and compare it with what MLflow holds, byte for byte.
 
 Nothing is written to MLflow.
 
@@ -12,29 +12,28 @@ import hashlib
 import math
 import random
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from study.cell.flow import cell_flow
 from study.cell.job import CellJob
 from study.compute.provenance import cores
 from study.config.grid import Cell
 from study.config.keys import cell_key
 from study.config.settings import StudySettings
-from study.config.workspace import DATA
 from study.console.display import Display
-from study.console.options import Parser, add_tracking_option
 from study.data.prepare import data_flow
 from study.engine.flows import run_flow
+from study.engine.local import local_engine
 from study.errors import BadInputError, one_of
 from study.results.cell_result import ARRAYS, CURVE_COLUMNS, CellResult
-from study.stages import cell_cost
-from study.sweep.options import add_plan_options
-from study.sweep.plan import Plan, given_plan, look_up
+from study.sweep.plan import Plan, look_up, plan_display
 from study.tracking.metrics import final_scores
 
 EXIT_DIFFERS = 1
@@ -52,7 +51,7 @@ class Difference:
 
 
 def differences(recorded: CellResult, again: CellResult) -> list[Difference]:
-    """What differs between two results, bit for bit: curves, weights, samples and predictions. Not the facts."""
+    """Return what differs between two results, bit for bit: curves, weights, samples and predictions. Not the facts."""
     pairs = {f"curves: {name}": _columns(recorded, again, name) for name in CURVE_COLUMNS}
     for part in ARRAYS:
         mine, theirs = getattr(recorded, part), getattr(again, part)
@@ -79,12 +78,12 @@ def _difference(name: str, left: NDArray[Any] | None, right: NDArray[Any] | None
 
 
 def changes(recorded: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """What of the recorded facts that a bit can hang on is not so now, in words; what was not recorded is left out."""
-    found = []
-    for name, before, here in _conditions(recorded, now):
-        if before is not None and before != here:
-            found.append(f"{name}: {before or 'none'} then, {here or 'none'} now")
-    return found
+    """Return in words which recorded conditions that can change a bit are different now."""
+    return [
+        f"{name}: {before or 'none'} then, {here or 'none'} now"
+        for name, before, here in _conditions(recorded, now)
+        if before is not None and before != here
+    ]
 
 
 def _conditions(recorded: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
@@ -105,7 +104,7 @@ def _digest(diff: str | None) -> str | None:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class Agreement:
     """How far two results agree in the end: mean accuracy over policies of the last five epochs, and what may be."""
 
     recorded: float
@@ -114,22 +113,22 @@ class Verdict:
 
     @property
     def close(self) -> bool:
-        """Whether they agree."""
+        """Return whether they agree."""
         return abs(self.recorded - self.again) <= self.allowed
 
 
-def judge(recorded: CellResult, again: CellResult, allowance: float) -> Verdict:
+def judge(recorded: CellResult, again: CellResult, allowance: float) -> Agreement:
     """Compare final accuracies where equal bits are not to be expected.
 
     Allowed is what two encoders may differ by their seeds alone, and three standard errors of the difference.
     """
     scores = [final_scores(result)[ACCURACY].to_numpy(np.float64) for result in (recorded, again)]
     errors = [each.var(ddof=1) / len(each) if len(each) > 1 else 0.0 for each in scores]
-    return Verdict(float(scores[0].mean()), float(scores[1].mean()), allowance + 3 * math.sqrt(sum(errors)))
+    return Agreement(float(scores[0].mean()), float(scores[1].mean()), allowance + 3 * math.sqrt(sum(errors)))
 
 
 def choose(finished: Mapping[str, Cell], wanted: str | None, seed: int) -> str:
-    """The key of the finished cell of that label or key, or of one drawn from the seed. Raises BadInputError."""
+    """Return the key of the finished cell of that label or key, or of one drawn from the seed. Raises BadInputError."""
     if wanted is None:
         return random.Random(f"verify {seed}").choice(sorted(finished))  # noqa: S311 - no secret
     for key, cell in finished.items():
@@ -139,13 +138,7 @@ def choose(finished: Mapping[str, Cell], wanted: str | None, seed: int) -> str:
 
 
 def compute_again(plan: Plan, recorded: CellResult, display: Display) -> CellResult:
-    """The cell of a result once more, as its facts say: threads, device, precision. Leaves only frames behind."""
-    # Finding nothing to verify needs none of these.
-    import torch  # noqa: PLC0415
-
-    from study.cell.flow import cell_flow  # noqa: PLC0415
-    from study.engine.local import local_engine  # noqa: PLC0415
-
+    """Compute the cell of a result again, as its facts say: threads, device, precision. Only frames are kept."""
     own = {name: value for name, value in recorded.settings.items() if name in StudySettings.model_fields}
     own["encoder"] = own["encoder"] | {"precision": recorded.facts["precision"]}  # "auto" is another elsewhere
     settings = StudySettings.model_validate(own)
@@ -155,10 +148,10 @@ def compute_again(plan: Plan, recorded: CellResult, display: Display) -> CellRes
     alike = [gpu for gpu in gpus if torch.cuda.get_device_name(int(gpu)) == name]
     use = [] if name.lower() == "cpu" else (alike or gpus)[:1]
     with (
-        local_engine(cores(), DATA / "tmp", use) as engine,
-        tempfile.TemporaryDirectory(prefix=".verify-", dir=DATA) as scratch,
+        local_engine(cores(), plan.workspace.tmp, use) as engine,
+        tempfile.TemporaryDirectory(prefix=".verify-", dir=plan.workspace.data) as scratch,
     ):
-        frames = run_flow(data_flow(plan.settings, DATA, plan.imported), engine, display.data)
+        frames = run_flow(data_flow(plan.settings, plan.workspace.data, plan.imported), engine, display.data)
         display.start(recorded.key)
         job = CellJob(
             recorded.cell,
@@ -179,35 +172,17 @@ def compute_again(plan: Plan, recorded: CellResult, display: Display) -> CellRes
         return CellResult.load(again.save(Path(scratch) / "result"))  # as the recorded one was
 
 
-# --- the command ----------------------------------------------------------------------------------------------------
-
-
-def main(args: Sequence[str]) -> int:
-    """Run the command and return its exit code."""
-    made = Parser(
-        prog="study.sweep verify",
-        usage="python -m study.sweep verify NAME [--cell CELL] [--seed N] [--tracking URI] [--group.setting VALUE ...]",
-        description="Compute a finished cell again and compare curves, weights and predictions byte for byte.",
-    )
-    add_plan_options(made)
-    made.add_argument("--cell", help="label or key of a finished cell, as --dry-run shows them (default: any)")
-    made.add_argument("--seed", type=int, default=random.randrange(10**6), help="draws the cell (default: any)")  # noqa: S311
-    add_tracking_option(made)
-    options = made.parse(args)
-    plan = given_plan(options)
-    tracker = look_up(options.tracking)
-    runs = tracker.finished(list(plan.cells)) if tracker else {}
-    if not tracker or not runs:
-        raise BadInputError(f"no cell of {plan.grid.name} ({plan.profile}) is finished; run the sweep first")
-    key = choose({key: plan.cells[key] for key in runs}, options.cell, options.seed)
-    cell = plan.cells[key]
-    print(f"{cell.label} ({key})" + ("" if options.cell else f", drawn with --seed {options.seed}"))
-    recorded = tracker.load_result(runs[key])
-    cost = cell_cost(plan.settings, cell, plan.grid.policy_seeds).seconds
-    ready = (plan.frames / "manifest.json").is_file()
-    data_seconds = 0.0 if ready else plan.data_cost.seconds
-    DATA.mkdir(exist_ok=True)
-    with Display("verify", {key: cost}, {key: cell.label}, data_seconds, plan.works) as display:
+def verify(plan: Plan, tracking: str, wanted: str | None, seed: int) -> int:
+    """Compute a finished cell again, print how it compares, and return the exit code."""
+    reader = look_up(tracking)
+    runs = reader.finished(list(plan.cells)) if reader else {}
+    if not reader or not runs:
+        raise BadInputError(f"no cell of {plan.title} is finished; run the sweep first")
+    key = choose({key: plan.cells[key] for key in runs}, wanted, seed)
+    print(f"{plan.cells[key].label} ({key})" + ("" if wanted else f", drawn with --seed {seed}"))
+    recorded = reader.load_result(runs[key])
+    plan.workspace.data.mkdir(exist_ok=True)
+    with plan_display(plan, [key]) as display:
         again = compute_again(plan, recorded, display)
     return report(recorded, again, plan.grid.rules.encoder_allowance)
 
@@ -229,10 +204,10 @@ def report(recorded: CellResult, again: CellResult, allowance: float) -> int:
     print("equal bytes were not to be expected:")
     for line in other:
         print(f"  {line if len(line) < 200 else line[:200] + '...'}")
-    verdict = judge(recorded, again, allowance)
+    agreement = judge(recorded, again, allowance)
     print(
-        f"final accuracy {verdict.recorded:.4f} then, {verdict.again:.4f} now: "
-        f"{'within' if verdict.close else 'NOT within'} {verdict.allowed:.4f} "
+        f"final accuracy {agreement.recorded:.4f} then, {agreement.again:.4f} now: "
+        f"{'within' if agreement.close else 'NOT within'} {agreement.allowed:.4f} "
         f"({allowance:g} for another encoder, and three standard errors)"
     )
-    return 0 if verdict.close else EXIT_DIFFERS
+    return 0 if agreement.close else EXIT_DIFFERS

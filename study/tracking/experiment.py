@@ -24,7 +24,7 @@ from mlflow.exceptions import MlflowException
 from mlflow.tracking import MlflowClient
 from sqlalchemy.exc import SQLAlchemyError  # MLflow depends on sqlalchemy and lets its errors through
 
-from study.config.workspace import DEFAULT_TRACKING
+from study.config.workspace import HERE
 from study.errors import BadInputError, masked
 from study.tracking.run_page import experiment_tags
 
@@ -164,7 +164,7 @@ def _connect(uri: str) -> tuple[MlflowClient, str, Path | None]:
         logging.getLogger(name).setLevel(logging.CRITICAL)
     shown = masked(uri)
     if not uri.startswith(SCHEMES) or uri == SQLITE:
-        raise BadInputError(f"tracking URI '{shown}' cannot be used; give {DEFAULT_TRACKING} or http://host:port")
+        raise BadInputError(f"tracking URI '{shown}' cannot be used; give {HERE.tracking} or http://host:port")
     database, artifacts = database_file(uri), None
     if database:
         _prepare_database(database, shown)
@@ -172,7 +172,7 @@ def _connect(uri: str) -> tuple[MlflowClient, str, Path | None]:
     elif uri.startswith("http"):
         _probe(uri, shown)
     else:
-        artifacts = Path(DEFAULT_TRACKING.removeprefix(SQLITE)).absolute().parent / "artifacts"
+        artifacts = HERE.mlruns.absolute() / "artifacts"
     with guard(shown, opening=True), few_tries(BUSY):
         return MlflowClient(uri), shown, artifacts
 
@@ -205,7 +205,7 @@ def _probe(uri: str, shown: str) -> None:
     except (OSError, ValueError) as error:
         raise TrackerLostError(
             f"the tracking server {shown} does not answer ({getattr(error, 'reason', error)}); start it (mlflow "
-            f"server), check the address, or leave --tracking out to use {DEFAULT_TRACKING}"
+            f"server), check the address, or leave --tracking out to use {HERE.tracking}"
         ) from None
 
 

@@ -15,7 +15,7 @@ from mlflow.entities import Run
 
 from study.config.grid import Cell, Grid
 from study.config.settings import StudySettings
-from study.config.workspace import DEFAULT_TRACKING
+from study.config.workspace import HERE
 from study.errors import BadInputError
 from study.results.cell_result import CellResult
 from study.results.sweep_record import SweepRecord
@@ -44,7 +44,7 @@ class Reader:
     experiment: Experiment
 
     @classmethod
-    def look(cls, uri: str = DEFAULT_TRACKING, experiment: str = "study") -> Self | None:
+    def look(cls, uri: str = HERE.tracking, experiment: str = "study") -> Self | None:
         """Return a reader, or None where nothing was tracked yet, and create nothing."""
         opened = find_experiment(uri, experiment)
         return cls(opened) if opened else None

@@ -29,7 +29,7 @@ from mlflow.entities import Dataset, DatasetInput, InputTag, Metric, Param, RunT
 from study.config.grid import Cell, Grid
 from study.config.keys import content_key
 from study.config.settings import StudySettings
-from study.config.workspace import DEFAULT_TRACKING
+from study.config.workspace import HERE
 from study.errors import masked
 from study.results.cell_result import CellResult
 from study.tracking.cell_run import ALIVE, HOST, PROCESS, CellRun, Status
@@ -49,7 +49,7 @@ class Tracker:
     Every method raises TrackerLostError, a BadInputError, when the store stops answering.
     """
 
-    def __init__(self, uri: str = DEFAULT_TRACKING, experiment: str = "study") -> None:
+    def __init__(self, uri: str = HERE.tracking, experiment: str = "study") -> None:
         """Open the store and create what is missing. Raises BadInputError when it cannot be used."""
         self.experiment = open_experiment(uri, experiment)
         self.reader = Reader(self.experiment)

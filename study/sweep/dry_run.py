@@ -1,0 +1,46 @@
+"""Show what a sweep would run, and what that costs, without loading what it needs to run."""
+
+from __future__ import annotations
+
+import json
+
+from study.config.heads import HEADS
+from study.config.paper import parameter_counts
+from study.stages import Cost, duration_text, size_text, total
+from study.sweep.plan import Plan, look_up
+
+
+def dry_run(plan: Plan, tracking: str, *, as_json: bool) -> int:
+    """Print the plan, what of it is finished, and what the rest costs."""
+    tracker = look_up(tracking)
+    done = tracker.finished(list(plan.cells)) if tracker else {}
+    costs = {key: cost for key, cost in plan.costs.items() if key not in done}
+    data_cost = Cost(0, 0) if plan.frames_ready or not costs else plan.data_cost
+    cost, counts, frames = total([data_cost, *costs.values()]), parameter_counts(), plan.settings.frames
+    facts = {
+        "sweep": plan.grid.name,
+        "profile": plan.profile,
+        "cells": [
+            {"key": key, **cell.model_dump(), "status": "waiting" if key in costs else "finished"}
+            for key, cell in plan.cells.items()
+        ],
+        "policy_seeds": plan.grid.policy_seeds,
+        "parameters": counts,
+        "frames": {"encoder": frames.encoder, "policy": frames.policy},
+        "seconds": round(cost.seconds, 1),
+        "bytes": cost.bytes,
+    }
+    if as_json:
+        print(json.dumps(facts))
+        return 0
+    print(f"{plan.title}: {plan.grid.title}\n")
+    for key, cell in plan.cells.items():
+        state = f"waiting, about {duration_text(costs[key].seconds)}" if key in costs else "finished"
+        print(f"  {cell.label:<22} {key}  {plan.grid.policy_seeds} policies  {state}")
+    heads = ", ".join(f"{head} head {counts[head]:,}" for head in HEADS)
+    where = "there already" if plan.frames_ready else f"about {duration_text(data_cost.seconds)} to make"
+    print(f"\nparameters  encoder {counts['encoder']:,}, {heads}")
+    print(f"frames      {frames.encoder:,} for encoders, {frames.policy:,} for policies; {where}")
+    print(f"disk        about {size_text(cost.bytes)}")
+    print(f"time        about {duration_text(cost.seconds)} on 2 CPU cores")
+    return 0
