@@ -52,7 +52,7 @@ Timed = dict[str, float]
 
 
 def timed(stage: str, into: Timed, clock: Callable[[], float], work: Callable[[], Any]) -> Any:
-    """What `work` returns; its seconds and its highest resident memory go to `into`."""
+    """Return what `work` returns; its seconds and its highest resident memory go to `into`."""
     Path("/proc/self/clear_refs").write_text("5")  # the highest resident memory is counted anew
     begin = clock()
     result = work()
@@ -131,7 +131,7 @@ def one_round(settings: StudySettings, seed: int) -> dict[str, float]:
 
 
 def pixels(side: int, frames: int) -> None:
-    """What a frame costs before anything is painted: cut the map, colour it, average it; the masks' averages."""
+    """Do what a frame costs before anything is painted: cut the map, colour it, average it; the masks' averages."""
     picture = np.zeros((8 * side, 8 * side), np.uint8)
     table = np.arange(256, dtype=np.uint8)
     canvas, flat = np.empty((side, side), np.uint8), np.empty((side, side), np.uint8)
@@ -245,7 +245,7 @@ def spread(values: list[float]) -> dict[str, float]:
 
 
 def machine() -> dict[str, Any]:
-    """What it was measured on, and how busy that was before."""
+    """Return what it was measured on, and how busy that was before."""
     facts = provenance()
     return {
         "cpu": facts["cpu"],
@@ -260,7 +260,7 @@ def machine() -> dict[str, Any]:
 
 
 def table(rounds: list[dict[str, float]]) -> str:
-    """The stages for people."""
+    """Print the stages for people."""
     units = {
         "stock": "vehicle-frames/s",
         "simulate": "vehicle-frames/s",

@@ -90,7 +90,7 @@ def report_often(report: Callable[..., None]) -> float:
 
 
 def batch(tasks: list[Task]) -> Flow[list[Any]]:
-    """A flow of one stage."""
+    """Yield one batch of one stage."""
     return (yield Batch(tasks))
 
 
@@ -135,7 +135,7 @@ def train_cell(engine: DaskEngine, plan: Plan) -> tuple[CellResult, bytes]:
 
 
 def measure_tracking(plan: Plan, result: CellResult, network: bytes) -> Numbers:
-    """What a sweep of CELLS cells takes in MLflow and Optuna, all with the same result."""
+    """Measure what a sweep of CELLS cells takes in MLflow and Optuna, all with the same result."""
     # Not at the top: workers load this file, too, and in a sweep they need no MLflow.
     from study.engine.trials import Trials  # noqa: PLC0415
     from study.tracking.tracker import Tracker  # noqa: PLC0415
@@ -230,7 +230,7 @@ def overhead(counts: Numbers, measured: Numbers) -> Numbers:
 
 
 def machine() -> Numbers:
-    """What measured."""
+    """Return the machine that measured."""
     facts = provenance()
     return {
         **{name: facts[name] for name in ("cpu", "cores", "platform", "python", "commit")},

@@ -24,7 +24,7 @@ from study.tracking.tracker import Tracker
 
 
 def posing(curves: pd.DataFrame, seeds: tuple[int, ...]) -> Panel:
-    """The curves of four encoders of one head set as those of the four head sets."""
+    """Return the curves of four encoders of one head set as those of the four head sets."""
     found = {}
     for name, seed in zip(HEAD_SETS, seeds, strict=True):
         own = curves.xs(seed, level="encoder_seed", drop_level=False)

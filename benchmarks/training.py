@@ -262,7 +262,7 @@ def turn_about(
 
 
 def one_batch(*tasks: Task) -> Flow[list[Any]]:
-    """A flow of one stage."""
+    """Yield one batch of one stage."""
     return (yield Batch(tasks))
 
 
@@ -458,7 +458,7 @@ def policies(engine: DaskEngine, size: str, limits: Numbers, began: float) -> Nu
 
 
 def machine() -> Numbers:
-    """What measured."""
+    """Return the machine that measured."""
     made_by = provenance()
     return {
         "cpu": made_by["cpu"],

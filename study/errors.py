@@ -19,13 +19,13 @@ class TrainingDivergedError(RuntimeError):
 
 
 def one_of(what: str, got: object, allowed: object) -> BadInputError:
-    """Error for a name that is not among the allowed ones."""
+    """Return the error for a name that is not among the allowed ones."""
     names = ", ".join(str(name) for name in allowed)  # type: ignore[attr-defined]
     return BadInputError(f"unknown {what} '{got}'; choose from {names}")
 
 
 def masked(text: str) -> str:
-    """The text with the credentials of any URI in it hidden."""
+    """Hide the credentials of any URI in a text."""
     text = re.sub(r"(\w://)[^/@\s]*@", r"\1***@", text)
     return re.sub(r"(?i)\b(password=)[^&\s]+", r"\1***", text)
 
@@ -40,7 +40,7 @@ WRITE_ERRORS = (
 
 
 def cannot_write(path: Path, error: OSError) -> str:
-    """What to tell a user of one of the WRITE_ERRORS."""
+    """Explain one of the WRITE_ERRORS to a user."""
     return (
         f"cannot write {path}: {error.strerror}; make room or name another folder, then give the same command again: "
         "it goes on where it was"

@@ -5,14 +5,14 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 from study.stages import CELL_STAGES, STAGES, Work, duration_text, share_done
 
-if TYPE_CHECKING:  # plain lines need no rich, and a machine that only trains may lack it
-    from rich.live import Live
-    from rich.table import Table
-
+try:
+    from study.console import terminal
+except ImportError:  # plain lines need no rich, and a machine that only trains may lack it
+    terminal = None  # type: ignore[assignment]
 
 LINE_EVERY = 15.0  # [s] between two plain lines
 DATA_KEY = ""
@@ -22,15 +22,8 @@ DATA_SHARES = {"record": (0.0, 0.8), "select": (0.8, 0.0), "render": (0.8, 0.2),
 
 def show_table(rows: Sequence[Sequence[str]], styles: Sequence[str]) -> None:
     """Print rows of columns, each row in its style (rich's names) on a terminal; plain aligned text in a pipe."""
-    if sys.stdout.isatty():
-        from rich.console import Console  # noqa: PLC0415
-        from rich.table import Table  # noqa: PLC0415
-        from rich.text import Text  # noqa: PLC0415
-
-        table = Table.grid(padding=(0, 2))
-        for row, style in zip(rows, styles, strict=True):
-            table.add_row(*map(Text, row), style=style)
-        Console().print(table)
+    if terminal and sys.stdout.isatty():
+        terminal.print_table(rows, styles)
         return
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
@@ -59,10 +52,10 @@ class Display:
         self._total = len(labels)
         self._finished = len(labels) - len(costs)
         self._failed = 0
-        self._began = self._said = time.monotonic()
+        self._began = self._printed = time.monotonic()
         self._resumed: dict[str, float] = {}
         self._data_since: dict[str, tuple[float, int]] = {}  # data stage -> when it began, and what was there then
-        self._live = _live()
+        self._live = terminal.live_part() if terminal else None
 
     def __enter__(self) -> Self:
         self.say(f"{self._title}: {self._finished} of {self._total} cells finished" if self._total else self._title)
@@ -74,10 +67,10 @@ class Display:
         if self._live:
             self._live.stop()
 
-    def data(self, stage: str, done: int, whole: int) -> None:
-        """The data stage has come this far; what was there when it began does not count as speed."""
+    def data(self, stage: str, done: int, total: int) -> None:
+        """Show how far the data is; what was there when its stage began does not count as speed."""
         before, part = DATA_SHARES[stage]
-        share = before + part * done / max(whole, 1)
+        share = before + part * done / max(total, 1)
         now = time.monotonic()
         if stage not in self._data_since:
             self._data_since[stage] = (now, done)
@@ -85,33 +78,33 @@ class Display:
         self._shares[DATA_KEY] = share
         began, there = self._data_since[stage]
         rate = (done - there) / (now - began) if now > began else 0.0
-        said = f", {rate:,.0f}/s" if rate >= 100 else f", {rate:.2g}/s" if rate else ""
-        self._state[DATA_KEY] = f"{STAGES[stage].activity} {done:,}/{whole:,}{said}"
-        if stage in ("render", "describe") and done == whole:
+        speed = f", {rate:,.0f}/s" if rate >= 100 else f", {rate:.2g}/s" if rate else ""
+        self._state[DATA_KEY] = f"{STAGES[stage].activity} {done:,}/{total:,}{speed}"
+        if stage in ("render", "describe") and done == total:
             self._state.pop(DATA_KEY)
         self.tick()
 
     def start(self, key: str) -> None:
-        """A cell starts."""
+        """Show that a cell starts."""
         self._shares[key] = 0.0
         self._state[key] = "starting"
         self.tick(now=True)
 
-    def progress(self, key: str, stage: str, done: int, whole: int) -> None:
-        """A cell has come this far in a stage."""
+    def progress(self, key: str, stage: str, done: int, total: int) -> None:
+        """Show how far a cell is in a stage."""
         kind = STAGES[stage]
-        self._shares[key] = share_done(CELL_STAGES, self._works[key], kind, done / max(whole, 1))
+        self._shares[key] = share_done(CELL_STAGES, self._works[key], kind, done / max(total, 1))
         self._resumed.setdefault(key, self._shares[key] if done > 1 else 0.0)
-        self._state[key] = f"{kind.activity}, {kind.unit} {done:,}/{whole:,}" if whole > 1 else kind.activity
+        self._state[key] = f"{kind.activity}, {kind.unit} {done:,}/{total:,}" if total > 1 else kind.activity
         self.tick()
 
     def finish(self, key: str) -> None:
-        """A cell is committed."""
+        """Say that a cell is committed."""
         self._finished += 1
         self._end(key, "finished")
 
     def fail(self, key: str) -> None:
-        """A cell is given up."""
+        """Say that a cell is given up."""
         self._failed += 1
         self._end(key, "FAILED")
 
@@ -121,15 +114,15 @@ class Display:
         self.say(f"{self._labels[key]}: {how}; {self._summary()}")
 
     def say(self, line: str) -> None:
-        """A line that stays."""
+        """Print a line that stays."""
         if self._live and self._live.is_started:
             self._live.console.print(line, markup=False, highlight=False)
         else:
             print(f"{time.strftime('%H:%M:%S')}  {line}", file=sys.stderr, flush=True)
-        self._said = time.monotonic()
+        self._printed = time.monotonic()
 
     def left(self) -> float | None:
-        """Seconds left, or None before anything is known."""
+        """Return the seconds left, or None before anything is known."""
         spent = sum(self._costs[key] * (share - self._resumed.get(key, 0)) for key, share in self._shares.items())
         open_ = sum(self._costs[key] * (1 - share) for key, share in self._shares.items())
         elapsed = time.monotonic() - self._began
@@ -139,42 +132,21 @@ class Display:
 
     def _summary(self) -> str:
         left = self.left()
-        said = [f"cells {self._finished}/{self._total}"] if self._total else []
-        said += [f"{self._failed} failed"] if self._failed else []
-        said += [] if left is None else [f"about {duration_text(left)} left"]
-        return ", ".join(said)
+        parts = [f"cells {self._finished}/{self._total}"] if self._total else []
+        parts += [f"{self._failed} failed"] if self._failed else []
+        parts += [] if left is None else [f"about {duration_text(left)} left"]
+        return ", ".join(parts)
 
     def tick(self, *, now: bool = False) -> None:
         """Draw again; a plain line only now and then."""
         if self._live and self._live.is_started:
-            self._live.update(self._picture(), refresh=True)
-        elif now or time.monotonic() - self._said > LINE_EVERY:
+            rows = ((self._labels.get(key, "data"), self._shares[key], state) for key, state in self._state.items())
+            share = self._done() / (sum(self._costs.values()) or 1)
+            drawing = terminal.bars(rows, title=self._title, share=share, summary=self._summary())
+            self._live.update(drawing, refresh=True)
+        elif now or time.monotonic() - self._printed > LINE_EVERY:
             running = "; ".join(f"{self._labels.get(key, 'data')}: {state}" for key, state in self._state.items())
             self.say("; ".join(part for part in (running or "waiting", self._summary()) if part))
 
-    def _picture(self) -> Table:
-        from rich.progress_bar import ProgressBar  # noqa: PLC0415
-        from rich.table import Table  # noqa: PLC0415
-        from rich.text import Text  # noqa: PLC0415
-
-        table = Table.grid(padding=(0, 2))
-        for key, state in self._state.items():
-            bar = ProgressBar(total=1.0, completed=self._shares[key], width=30)
-            table.add_row(Text(self._labels.get(key, "data")), bar, Text(state))
-        done = ProgressBar(total=sum(self._costs.values()) or 1, completed=self._done(), width=30)
-        table.add_row(Text(self._title, style="bold"), done, Text(self._summary()))
-        return table
-
     def _done(self) -> float:
         return sum(self._costs[key] * share for key, share in self._shares.items())
-
-
-def _live() -> Live | None:
-    """The part of a terminal that is drawn anew; None where there is no terminal, or no rich to draw with."""
-    try:
-        from rich.console import Console  # noqa: PLC0415
-        from rich.live import Live  # noqa: PLC0415
-    except ImportError:
-        return None
-    console = Console(file=sys.stderr)
-    return Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
