@@ -80,12 +80,11 @@ def bundled(parameter: str, build: Callable[..., Any], *options: Decorator) -> D
             built = build(**{name: values.pop(name) for name in names})
             return command(**values, **{parameter: built})
 
-        count = len(getattr(call, "__click_params__", ()))
         for option in reversed(options):
             option(call)
-        names = [each.name for each in call.__click_params__[count:]]  # type: ignore[attr-defined]
         return call
 
+    names = [each.name for option in options for each in click.command("probe")(option(lambda: None)).params]
     return decorate
 
 
