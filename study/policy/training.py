@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from study.compute.device import keep_memory
 from study.compute.trainer import trainer
 from study.config.paper import ACCELERATIONS, LATENT
 from study.config.settings import PolicySettings
@@ -91,6 +92,8 @@ def train_policies(
         if progress:
             progress(epoch, settings.epochs)
 
+    if device == "cpu":
+        keep_memory()
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
