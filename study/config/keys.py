@@ -31,12 +31,12 @@ FORMAT_VERSIONS = {"episodes": 2, "frames": 2, "encoder": 2, "state": 1, "cell":
 
 def recording_key(settings: StudySettings) -> str:
     """Key of the drives: each is then known by its seed. How many there are does not matter here."""
-    own = {
+    parts = {
         "town": settings.town.model_dump(mode="json"),
         "warm_up": settings.recording.warm_up,
         "duration": settings.recording.duration,
     }
-    return content_key("episodes", own, (), FORMAT_VERSIONS["episodes"])
+    return content_key("episodes", parts, (), FORMAT_VERSIONS["episodes"])
 
 
 def drive_name(seed: int) -> str:
@@ -46,35 +46,35 @@ def drive_name(seed: int) -> str:
 
 def frames_key(settings: StudySettings, source: str | None = None) -> str:
     """Key of the frame store; `source` stands for the drives when they are not our town's."""
-    own: dict[str, Any] = {
+    parts: dict[str, Any] = {
         "frames": settings.frames.model_dump(mode="json", exclude={"unit"}),  # says how a store is used
         "birdview": settings.birdview.model_dump(mode="json"),
     }
     if further_masks():
-        own["masks"] = further_masks()
+        parts["masks"] = further_masks()
     if source is None:
-        own["drives"] = settings.recording.model_dump(
+        parts["drives"] = settings.recording.model_dump(
             mode="json", include={"encoder_episodes", "policy_episodes", "seed"}
         )
-    return content_key("frames", own, (source or recording_key(settings),), FORMAT_VERSIONS["frames"])
+    return content_key("frames", parts, (source or recording_key(settings),), FORMAT_VERSIONS["frames"])
 
 
 def encoder_key(settings: StudySettings, cell: Cell, frames: str) -> str:
     """Key of a trained encoder. What makes no difference at the full data is left out there."""
     if cell.heads == CEILING:
         return content_key("state", {}, (frames,), FORMAT_VERSIONS["state"])
-    own: dict[str, Any] = {
+    parts: dict[str, Any] = {
         "encoder": settings.encoder.model_dump(mode="json", exclude={"budget", "head_weights"}),
         "heads": {head: settings.encoder.head_weights.get(head, 1.0) for head in HEAD_SETS[cell.heads].heads},
         "fraction": cell.fraction,
         "encoder_seed": cell.encoder_seed,
     }
     if cell.fraction < 1:
-        own |= {"budget": settings.encoder.budget, "unit": settings.frames.unit}
-    return content_key("encoder", own, (frames,), FORMAT_VERSIONS["encoder"])
+        parts |= {"budget": settings.encoder.budget, "unit": settings.frames.unit}
+    return content_key("encoder", parts, (frames,), FORMAT_VERSIONS["encoder"])
 
 
 def cell_key(settings: StudySettings, cell: Cell, policy_seeds: int, frames: str) -> str:
     """Key of a cell's result: its encoder and the policies on it."""
-    own = {"policy": settings.policy.model_dump(mode="json"), "policy_seeds": policy_seeds}
-    return content_key("cell", own, (encoder_key(settings, cell, frames),), FORMAT_VERSIONS["cell"])
+    parts = {"policy": settings.policy.model_dump(mode="json"), "policy_seeds": policy_seeds}
+    return content_key("cell", parts, (encoder_key(settings, cell, frames),), FORMAT_VERSIONS["cell"])

@@ -128,28 +128,28 @@ def _first_results(record: SweepRecord, report: Report) -> dict[str, CellResult]
 
 def _latents(results: dict[str, CellResult]) -> Drawing | None:
     """Draw the latents of each head set on their principal components; not of results without the quantities."""
-    found = {name: result.predictions for name, result in results.items()}
-    if not found or any("speed" not in arrays for arrays in found.values()):
+    outputs = {name: result.predictions for name, result in results.items()}
+    if not outputs or any("speed" not in arrays for arrays in outputs.values()):
         return None
     return pictures.latent_maps(
         [
             (name, *predictions.principal(arrays["z"]), arrays["speed"], arrays["light"], arrays["steering_label"])
-            for name, arrays in found.items()
+            for name, arrays in outputs.items()
         ]
     )
 
 
 def _pictures(results: dict[str, CellResult]) -> dict[str, Drawing]:
     """Draw what the decoders of one encoder of each kind make of test frames."""
-    found = {name: result.samples for name, result in results.items()}
+    samples_of = {name: result.samples for name, result in results.items()}
     drawn: dict[str, Drawing] = {}
-    if "rec" in found:
-        rows = [("input", found["rec"]["input"]), ("reconstruction", found["rec"]["rec_output"])]
+    if "rec" in samples_of:
+        rows = [("input", samples_of["rec"]["input"]), ("reconstruction", samples_of["rec"]["rec_output"])]
         drawn["single_head_rec"] = pictures.picture_rows(rows)
-    if "full" in found:
-        drawn["multi_results"] = pictures.picture_rows(_head_by_head(found["full"]))
-    if len(found) > 1:
-        drawn["all_head_sets"] = pictures.picture_rows(_side_by_side(found))
+    if "full" in samples_of:
+        drawn["multi_results"] = pictures.picture_rows(_head_by_head(samples_of["full"]))
+    if len(samples_of) > 1:
+        drawn["all_head_sets"] = pictures.picture_rows(_side_by_side(samples_of))
     return drawn
 
 
@@ -176,11 +176,11 @@ def _head_by_head(samples: Arrays) -> Rows:
     return rows
 
 
-def _side_by_side(found: dict[str, Arrays]) -> Rows:
+def _side_by_side(samples_of: dict[str, Arrays]) -> Rows:
     """Return rows of pictures: for each head its target, then the output of every head set that has it."""
-    rows: Rows = [("input", next(iter(found.values()))["input"])]
-    for head in dict.fromkeys(head for samples in found.values() for head in _heads_of(samples)):
-        owners = {name: samples for name, samples in found.items() if f"{head}_output" in samples}
+    rows: Rows = [("input", next(iter(samples_of.values()))["input"])]
+    for head in dict.fromkeys(head for samples in samples_of.values() for head in _heads_of(samples)):
+        owners = {name: samples for name, samples in samples_of.items() if f"{head}_output" in samples}
         targets = [samples[f"{head}_target"] for samples in owners.values() if f"{head}_target" in samples]
         rows += [("", targets[0]), (f"{head} target", targets[0])] if targets else []
         rows += [(f"{head} of {name}", samples[f"{head}_output"]) for name, samples in owners.items()]

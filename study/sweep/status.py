@@ -67,17 +67,17 @@ def cell_statuses(plan: Plan, attempts: Mapping[str, Sequence[Attempt]], now: fl
 
 
 def _cell_status(plan: Plan, key: str, attempts: Sequence[Attempt], now: float) -> CellStatus:
-    found = CellStatus(key, plan.cells[key].label, "waiting", len(attempts))
+    status = CellStatus(key, plan.cells[key].label, "waiting", len(attempts))
     done = next((attempt for attempt in attempts if attempt.status == "FINISHED"), None)
     if done is not None:
-        return dataclasses.replace(found, state="finished", share=1.0, took=done.metrics.get("seconds/cell"))
+        return dataclasses.replace(status, state="finished", share=1.0, took=done.metrics.get("seconds/cell"))
     if not attempts:
-        return found
+        return status
     last = attempts[-1]
     if last.status == "FAILED":
-        return dataclasses.replace(found, state="failed", reason=_first(last.tags.get("reason", "unknown")))
+        return dataclasses.replace(status, state="failed", reason=_first(last.tags.get("reason", "unknown")))
     if last.status != "RUNNING":
-        return found
+        return status
     tags = last.tags
     quiet = max(0.0, now - float(tags.get("alive", last.started)) / 1000)
     state: State = "silent" if quiet > SILENT else "running"
@@ -85,7 +85,7 @@ def _cell_status(plan: Plan, key: str, attempts: Sequence[Attempt], now: float) 
     part, total = (int(number) for number in steps.split("/")) if steps else (0, 1)
     epochs = {"encoder": plan.settings.encoder.epochs, "policy": plan.settings.policy.epochs}.get(stage, 0)
     return dataclasses.replace(
-        found,
+        status,
         state=state,
         host=tags.get("host", ""),
         process=tags.get("process", ""),

@@ -56,7 +56,7 @@ def differences(recorded: CellResult, again: CellResult) -> list[Difference]:
     for part in ARRAYS:
         mine, theirs = getattr(recorded, part), getattr(again, part)
         pairs |= {f"{part}: {name}": (mine.get(name), theirs.get(name)) for name in sorted(mine | theirs)}
-    return [found for name, (left, right) in pairs.items() if (found := _difference(name, left, right))]
+    return [difference for name, (left, right) in pairs.items() if (difference := _difference(name, left, right))]
 
 
 def _columns(recorded: CellResult, again: CellResult, name: str) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -139,9 +139,9 @@ def choose(finished: Mapping[str, Cell], wanted: str | None, seed: int) -> str:
 
 def compute_again(plan: Plan, recorded: CellResult, display: Display) -> CellResult:
     """Compute the cell of a result again, as its facts say: threads, device, precision. Only frames are kept."""
-    own = {name: value for name, value in recorded.settings.items() if name in StudySettings.model_fields}
-    own["encoder"] = own["encoder"] | {"precision": recorded.facts["precision"]}  # "auto" is another elsewhere
-    settings = StudySettings.model_validate(own)
+    values = {name: value for name, value in recorded.settings.items() if name in StudySettings.model_fields}
+    values["encoder"] = values["encoder"] | {"precision": recorded.facts["precision"]}  # "auto" is another elsewhere
+    settings = StudySettings.model_validate(values)
     seeds = int(recorded.settings["policy_seeds"])
     gpus = [str(index) for index in range(torch.cuda.device_count())]
     name = recorded.facts["device"]
@@ -189,12 +189,12 @@ def verify(plan: Plan, tracking: str, wanted: str | None, seed: int) -> int:
 
 def report(recorded: CellResult, again: CellResult, allowance: float) -> int:
     """Print how a result and its repetition compare; 0 when they are as equal as could be expected."""
-    found = differences(recorded, again)
-    if not found:
+    unequal = differences(recorded, again)
+    if not unequal:
         print("equal: curves, weights, samples and predictions, byte for byte")
         return 0
-    print(f"{len(found)} arrays differ:")
-    for difference in found:
+    print(f"{len(unequal)} arrays differ:")
+    for difference in unequal:
         by = f"by up to {difference.largest:.3g}" if math.isfinite(difference.largest) else "in shape or words"
         print(f"  {difference.name}: {difference.values} values {by}")
     other = changes(recorded.facts, again.facts)
