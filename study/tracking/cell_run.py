@@ -18,7 +18,7 @@ from study.tracking.metrics import CurvePoint
 
 HOST, PROCESS, ALIVE = "host", "process", "alive"  # tags of an attempt: who writes it, and when last [ms since 1970]
 HEARTBEAT = 5.0  # [s] between two heartbeats
-FLUSH = 2.0  # [s] between two writes of live curves
+FLUSH = 5.0  # [s] between two writes of live curves
 
 Status = Literal["FINISHED", "FAILED", "KILLED"]
 
