@@ -249,6 +249,11 @@ def move(shift, hours):
     draft.replace(shift)
 
 
+def recording(run):
+    """Return whether drives were being recorded, in this run or an earlier one."""
+    return entries(run.folder, "data/episodes/*/.lock")
+
+
 def test_a_stopped_sweep_ends_within_five_seconds_and_says_how_to_go_on(undisturbed, tmp_path):
     """Ctrl-C, which reaches all processes of a terminal, and a batch system's SIGTERM, at any moment from the start."""
     folder = undisturbed.copy(tmp_path)
@@ -258,7 +263,7 @@ def test_a_stopped_sweep_ends_within_five_seconds_and_says_how_to_go_on(undistur
     for words, sign, how, whom in (
         ((*TWO, *drives), lambda run: "cells finished" in run.output, signal.SIGINT, "all"),
         ((*TWO, *drives), lambda run: run.pids("worker"), signal.SIGINT, "all"),
-        ((*TWO, *drives), lambda run: entries(run.folder, "data/episodes/*/.lock"), signal.SIGTERM, "client"),
+        ((*TWO, *drives), lambda run: recording(run) and "cells finished" in run.output, signal.SIGTERM, "client"),
         ((*TWO, *epochs), has_cells, signal.SIGTERM, "client"),
         ((*TWO, *epochs), has_cells, signal.SIGINT, "all"),
         ((*TWO, *epochs), lambda run: run.pids("worker"), signal.SIGINT, "all"),
