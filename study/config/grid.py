@@ -6,8 +6,9 @@ from typing import Annotated, Any, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from study.config.heads import CEILING, HEAD_SETS, load_heads
+from study.config.heads import CEILING, HEAD_SETS, heads_of, load_heads
 from study.config.settings import Count, NotNegative, Settings, Share
+from study.errors import BadInputError
 
 Fraction = Annotated[float, Field(gt=0, le=1)]
 OneOrMore = BeforeValidator(lambda value: value if isinstance(value, list | tuple) else (value,)), Field(min_length=1)
@@ -69,6 +70,10 @@ class Grid(Settings):
         for heads in (*self.heads, self.baseline):
             if heads not in HEAD_SETS:
                 raise ValueError(f"unknown head set '{heads}'; choose from {', '.join(HEAD_SETS)}")
+        try:
+            heads_of(self.heads)
+        except BadInputError as error:
+            raise ValueError(f"a head set in study/config/heads.py has an {error}") from error
         for name in ("heads", "fractions"):
             values = getattr(self, name)
             if len(set(values)) != len(values):

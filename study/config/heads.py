@@ -72,6 +72,15 @@ def further_masks() -> list[str]:
     return [head.target for head in mask_heads().values() if head.target not in PAPER_MASKS]
 
 
+def heads_of(head_sets: Iterable[str]) -> list[str]:
+    """Return the heads of some head sets, each once, in the order of HEADS. Raises BadInputError for an unknown one."""
+    wanted = [head for name in head_sets if name in HEAD_SETS for head in HEAD_SETS[name].heads]
+    for head in wanted:
+        if head not in HEADS:
+            raise one_of("head", head, HEADS)
+    return [head for head in HEADS if head in wanted]
+
+
 def load_heads(modules: Iterable[str]) -> None:
     """Add the records `HEADS` and `HEAD_SETS` of these modules to those here.
 

@@ -14,7 +14,7 @@ import pandas as pd
 from study.analysis import claims, confounds, convergence, effects, intervals, learning_curves, metrics, predictions
 from study.analysis.learning_curves import ACCURACY, STEERING, Point
 from study.analysis.metrics import METRICS
-from study.config.heads import HEADS
+from study.config.heads import HEADS, heads_of
 from study.config.paper import parameter_counts
 from study.products import Arrays
 from study.report.model import (
@@ -70,7 +70,7 @@ def summarise(record: SweepRecord) -> Report:
         ),
         rules=grid.rules.model_dump(mode="json"),
         settings=tuple(_settings(record)),
-        parameters=parameter_counts(),
+        parameters={name: parameter_counts()[name] for name in ("encoder", *heads_of(grid.heads))},
         data=_data(record),
         cost=_cost(record),
         provenance=_provenance(record),

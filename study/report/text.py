@@ -11,10 +11,11 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from study.analysis.claims import Verdict
 from study.analysis.metrics import Metric
+from study.config.heads import HEAD_SETS
 from study.report import rounding
 from study.report.document import Block, Inline, bold, code, italic, parse, plain, table
 from study.report.model import Report, Spread
-from study.report.rounding import LOSS, NOTHING, UNITS, interval, percent, show
+from study.report.rounding import LOSS, NOTHING, UNITS, interval, percent, show, thousands
 
 ROUNDINGS = ("duration", "epochs", "fixed", "gigabytes", "interval", "kinds", "percent", "points", "probability")
 
@@ -54,6 +55,12 @@ def _lists(report: Report) -> dict[str, Any]:
     main = [metric for metric in report.metrics if metric.guess]
     further = [metric for metric in report.metrics if not metric.guess]
     return {
+        "head_sets": ", ".join(
+            f"{name} ({HEAD_SETS[name].word})" if name in HEAD_SETS else name for name in sweep.heads
+        ),
+        "head_parameters": ", ".join(
+            f"{thousands(count)} ({head})" for head, count in report.parameters.items() if head != "encoder"
+        ),
         "hundredths": partial(percent, digits=2),
         "fractions": ", ".join(f"{round(100 * fraction, 2):g} %" for fraction in sweep.fractions),
         "outcomes": "; ".join(f"{len(names)} {word} ({', '.join(names)})" for word, names in report.outcomes.items()),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 
-from study.config.heads import HEADS
+from study.config.heads import heads_of
 from study.config.paper import parameter_counts
 from study.stages import Cost, duration_text, size_text, total
 from study.sweep.plan import Plan, look_up
@@ -37,7 +37,7 @@ def dry_run(plan: Plan, tracking: str, *, as_json: bool) -> int:
     for key, cell in plan.cells.items():
         state = f"waiting, about {duration_text(costs[key].seconds)}" if key in costs else "finished"
         print(f"  {cell.label:<22} {key}  {plan.grid.policy_seeds} policies  {state}")
-    heads = ", ".join(f"{head} head {counts[head]:,}" for head in HEADS)
+    heads = ", ".join(f"{head} head {counts[head]:,}" for head in heads_of(plan.grid.heads))
     where = "there already" if plan.frames_ready else f"about {duration_text(data_cost.seconds)} to make"
     print(f"\nparameters  encoder {counts['encoder']:,}, {heads}")
     print(f"frames      {frames.encoder:,} for encoders, {frames.policy:,} for policies; {where}")
