@@ -1,5 +1,6 @@
 """Settings refuse what they do not know; keys change exactly with what they stand for."""
 
+import dataclasses
 import itertools
 
 import pytest
@@ -169,6 +170,12 @@ def test_unknown_names_list_the_known_ones():
         load_grid("head")
     with pytest.raises(BadInputError, match="choose from laptop, paper, smoke"):
         load_profile("desktop")
+
+
+def test_a_head_set_with_an_unknown_head_is_one_clear_error(monkeypatch):
+    monkeypatch.setitem(HEAD_SETS, "full", dataclasses.replace(HEAD_SETS["full"], heads=("rec", "standng")))
+    with pytest.raises(BadInputError, match=r"unknown head 'standng'; choose from rec, pred, plan"):
+        load_grid("heads")
 
 
 @pytest.mark.parametrize("text", ["heads: [rec", "- a\n- b", "\x00", "just words"])

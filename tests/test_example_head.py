@@ -47,8 +47,10 @@ def test_a_sweep_with_the_example_ends_with_its_report(tmp_path: Path) -> None:
     curves = pd.read_parquet(tmp_path / "reports/light/curves.parquet")
     metrics = curves[curves["stage"] == "encoder"].groupby("heads")["metric"].unique()
     assert set(metrics["rec+light"]) == {"loss", "loss_rec", "loss_light"}
-    text = "".join(page.extract_text() for page in PdfReader(tmp_path / "reports/light.pdf").pages)
-    assert "rec+light" in text
+    text = " ".join(" ".join(page.extract_text() for page in PdfReader(tmp_path / "reports/light.pdf").pages).split())
+    assert "rec+light (reconstruction and traffic lights)" in text  # the words of the record
+    assert "(light)" in text  # its learnable numbers
+    assert "(pred)," not in text  # not those of heads that this sweep does not train
 
 
 @pytest.mark.parametrize(

@@ -47,7 +47,7 @@ def summarise(record: SweepRecord) -> Report:
     accuracy = panels[ACCURACY]
     finished = {point: accuracy[point] for point in effects.points(grid) if point in accuracy}
     base = accuracy.get((grid.baseline, max(grid.fractions)))
-    floor, ceiling = _floor(record), _ceiling(record)
+    floor, ceiling, counts = _floor(record), _ceiling(record), parameter_counts()
     contrasts = (effects.paired_contrasts(record, name, panel) for name, panel in panels.items())
     return Report(
         sweep=_sweep(record, "A" if learning_curves.design(accuracy.values()) == "A" else "B"),
@@ -70,7 +70,7 @@ def summarise(record: SweepRecord) -> Report:
         ),
         rules=grid.rules.model_dump(mode="json"),
         settings=tuple(_settings(record)),
-        parameters={name: parameter_counts()[name] for name in ("encoder", *heads_of(grid.heads))},
+        parameters={name: counts[name] for name in ("encoder", *heads_of(grid.heads))},
         data=_data(record),
         cost=_cost(record),
         provenance=_provenance(record),
