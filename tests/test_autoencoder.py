@@ -26,7 +26,7 @@ from study.config.paper import IMAGE, LATENT, parameter_counts
 from study.config.settings import BirdviewSettings, EncoderSettings, FramesSettings
 from study.data.build import frames_flow
 from study.data.frames import Frames, open_frames, unpack_masks
-from study.encoder import batches, networks, training
+from study.encoder import batches, bounds, networks, training
 from study.encoder.autoencoder import MultiHeadAutoencoder
 from study.encoder.batches import plan_training
 from study.encoder.inputs import mask_places, unpack
@@ -203,8 +203,10 @@ def test_masks_are_unpacked_as_the_frame_store_packs_them(frames: Frames) -> Non
     assert np.array_equal(unpacked["plan"].squeeze(1).numpy(), expected[:, 1])
 
 
-def test_loss_is_the_weighted_sum_of_cross_entropies(frames: Frames) -> None:
-    settings = EncoderSettings(head_weights={"rec": 2.0, "plan": 0.5})
+@pytest.mark.parametrize(("reduction", "channels"), [("sum", 3), ("mean", 1)])
+def test_loss_is_the_weighted_sum_of_cross_entropies(frames: Frames, reduction: Any, channels: int) -> None:
+    """Summed over an image's numbers, rec's weighs three times as much; what is logged by head is the mean."""
+    settings = EncoderSettings(loss=reduction, head_weights={"rec": 2.0, "plan": 0.5})
     module = MultiHeadAutoencoder("full", settings, 0)
     batch = torch.tensor(frames.images[:8]), torch.tensor(frames.masks[:8])
     losses = dict(zip(module.metrics, module.losses(*batch).tolist(), strict=True))
@@ -218,13 +220,14 @@ def test_loss_is_the_weighted_sum_of_cross_entropies(frames: Frames) -> None:
     assert losses["loss_rec"] == pytest.approx(
         float(functional.binary_cross_entropy(outputs["rec"].sigmoid(), pixels)), rel=1e-4
     )
-    total = 2 * losses["loss_rec"] + losses["loss_pred"] + 0.5 * losses["loss_plan"]
+    total = 2 * channels * losses["loss_rec"] + losses["loss_pred"] + 0.5 * losses["loss_plan"]
     assert losses["loss"] == pytest.approx(total, rel=1e-5)
 
 
-def test_gradients_taken_head_by_head_are_those_of_the_total_loss(frames: Frames) -> None:
-    """Also through the noise of a variational encoder, and with weights."""
-    settings = EncoderSettings(beta=0.3, head_weights={"rec": 2.0, "plan": 0.5})
+@pytest.mark.parametrize(("reduction", "numbers"), [("sum", 64 * 64), ("mean", 3 * 64 * 64)])
+def test_gradients_taken_head_by_head_are_those_of_the_total_loss(frames: Frames, reduction: Any, numbers: int) -> None:
+    """Also through the noise of a variational encoder, and with weights; KL keeps its relation to the likelihood."""
+    settings = EncoderSettings(loss=reduction, beta=0.3, head_weights={"rec": 2.0, "plan": 0.5})
     images, masks = torch.tensor(frames.images[:16]), torch.tensor(frames.masks[:16])
     module = MultiHeadAutoencoder("full", settings, 0)
     losses = dict(zip(module.metrics, module.gradients(images, masks, module._noise(16)).tolist(), strict=True))
@@ -237,8 +240,8 @@ def test_gradients_taken_head_by_head_are_those_of_the_total_loss(frames: Frames
     z = mean + (log_variance / 2).exp() * torch.randn(mean.shape, generator=noise)
     normal = torch.distributions.Normal
     kl = torch.distributions.kl_divergence(normal(mean, (log_variance / 2).exp()), normal(0.0, 1.0))
-    total = 0.3 * kl.sum(1).mean() / (3 * 64 * 64)
-    for head, weight in (("rec", 2.0), ("pred", 1.0), ("plan", 0.5)):
+    total = 0.3 * kl.sum(1).mean() / numbers
+    for head, weight in (("rec", 2.0 * 3 * 64 * 64 / numbers), ("pred", 1.0), ("plan", 0.5)):
         loss = functional.binary_cross_entropy_with_logits(
             reference.decoders[head](z), (targets | {"rec": pixels})[head]
         )
@@ -252,6 +255,34 @@ def test_gradients_taken_head_by_head_are_those_of_the_total_loss(frames: Frames
             assert torch.allclose(ours.grad, theirs.grad, rtol=1e-3, atol=1e-4 * float(theirs.grad.abs().max())), name
 
 
+def test_bounds_are_the_entropy_of_the_targets_and_the_loss_of_their_mean(
+    frames: Frames, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same numbers from torch's loss over all frames at once, and from blocks of any size."""
+    train_rows, test = frames.indices("train"), frames.indices("test")
+    masks = unpack_masks(frames.masks).astype(np.float64)
+    targets = {"rec": frames.images / 255, "pred": masks[:, 0], "plan": masks[:, 1]}
+    monkeypatch.setattr(bounds, "BLOCK", 7)
+    found = bounds.loss_bounds(frames, "full")
+    for head, values in targets.items():
+        truth = torch.from_numpy(values[test])
+        constant = torch.from_numpy((values[train_rows].sum(0) + 0.5) / (len(train_rows) + 1)).expand_as(truth)
+        assert found[head] == pytest.approx(
+            {
+                "entropy": float(functional.binary_cross_entropy(truth, truth)),
+                "constant": float(functional.binary_cross_entropy(constant, truth)),
+            }
+        )
+        assert found[head]["entropy"] < found[head]["constant"]
+    squared = replace(HEADS["rec"], loss="squared-error")
+    monkeypatch.setitem(HEADS, "rec", squared)
+    truth = targets["rec"][test]
+    constant = (targets["rec"][train_rows].sum(0) + 0.5) / (len(train_rows) + 1)
+    assert bounds.loss_bounds(frames, "rec")["rec"] == pytest.approx(
+        {"entropy": 0.0, "constant": np.square(truth - constant).mean()}
+    )
+
+
 # --- training -------------------------------------------------------------------------------------------------------
 
 
@@ -263,6 +294,9 @@ def test_each_heads_loss_is_logged_on_both_splits_every_epoch_and_falls(frames: 
         curve = trained.curves.query("split == @split and metric == @metric").sort_values("epoch")["value"].tolist()
         assert curve == [losses[f"{split}/{metric}"] for _, losses in logged]
         assert curve[1] < curve[0]
+    weights = {"loss_rec": 3, "loss_pred": 1, "loss_plan": 1}
+    totals = trained.curves.assign(value=lambda rows: rows["value"] * rows["metric"].map(weights).fillna(-1))
+    assert totals.groupby(["split", "epoch"])["value"].sum().abs().max() < 1e-5
     assert len(trained.curves) == 2 * 2 * 4
     assert trained.frames == len(frames.indices("train"))
 

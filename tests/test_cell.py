@@ -111,6 +111,8 @@ def test_facts_say_what_computed(new_job):
     result, _, _ = run(new_job(threads=1))
     facts = result.facts
     assert (facts["device"], facts["threads"]) == ("CPU", 1)
+    for head in facts["heads"].values():
+        assert 0 <= head["entropy"] < head["constant"]
     assert facts["frames"]["policy_train"] + facts["frames"]["policy_test"] == 40
     assert facts["seconds"]["cell"] == pytest.approx(
         sum(facts["seconds"][name] for name in ("encoder", "encode", "policies"))

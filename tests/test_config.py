@@ -102,6 +102,12 @@ def test_the_weight_of_an_absent_head_changes_nothing():
     assert encoder_key(one, Cell(heads="full"), "f") != encoder_key(other, Cell(heads="full"), "f")
 
 
+def test_sums_and_means_of_a_heads_loss_are_two_encoders():
+    one, other = StudySettings(), changed(encoder={"loss": "mean"})
+    assert one.encoder.loss == "sum"
+    assert encoder_key(one, Cell(heads="rec+plan"), "f") != encoder_key(other, Cell(heads="rec+plan"), "f")
+
+
 def test_the_budget_matters_below_the_full_data_only():
     one, other = StudySettings(), changed(encoder={"budget": "steps"})
     keys = [

@@ -148,6 +148,7 @@ ENCODERS_GRID = HEADS_GRID.model_copy(update={"heads": ("rec", "full"), "encoder
                 "latent_maps",
                 "all_head_sets",
                 "confusion",
+                "encoder_losses",
             },
         ),
         (ENCODERS_GRID, {"by_encoder"}),
@@ -161,7 +162,7 @@ def test_a_sweep_gets_every_figure_of_the_paper_with_n_in_the_caption(grid, name
     shown = {Path(item.file).stem: item for item in document(report) if isinstance(item, Picture)}
     assert set(shown) == set(report.figures)
     assert names <= set(shown)
-    for name in names - {"single_head_rec", "multi_results", "latent_maps", "all_head_sets"}:
+    for name in names - {"encoder_losses", "single_head_rec", "multi_results", "latent_maps", "all_head_sets"}:
         assert ("n = 3 encoders" if name == "by_encoder" else "n = 15 policies") in shown[name].caption
     assert all(item.alt for item in shown.values())
 

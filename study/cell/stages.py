@@ -22,6 +22,7 @@ from study.data.frames import FrameStore, open_frames
 from study.data.prepare import data_flow
 from study.data.true_state import true_state
 from study.driving.driver import export_driver
+from study.encoder.bounds import loss_bounds
 from study.encoder.latents import encode
 from study.encoder.training import train_encoder
 from study.engine.flows import run_flow
@@ -65,6 +66,7 @@ def train_cell_encoder(job: CellJob, report: Reporter) -> Product:
         progress=partial(report, "progress"),
     )
     facts |= {"frames": trained.frames, "precision": trained.precision}
+    facts |= {"heads": loss_bounds(store.encoder, cell.heads)}
     facts |= {"seconds": trained.seconds, "peak_bytes": peak_bytes()}
     return Product({"weights": trained.weights, "samples": trained.samples}, trained.curves, facts)
 
@@ -145,6 +147,7 @@ def assemble_result(
         },
         facts={
             "floor": float(np.bincount(labels["acceleration"]).max() / len(labels)),
+            "heads": encoder.facts["heads"] if encoder else {},
             "frames": {
                 "encoder_train": encoder.facts["frames"] if encoder else 0,
                 "encoder_test": latents.facts["encoder_test"],

@@ -113,8 +113,11 @@ class EncoderSettings(Settings):
     batch: Annotated[int, Field(ge=2)] = Field(128, description="batch size (Sec. IV-B: 2048)")
     lr: Positive = Field(2e-3, description="Adam's learning rate (Sec. IV-B: '5^{-3}', read as 5e-3)")
     beta: NotNegative = Field(0.0, description="weight of the KL term; above 0 the autoencoder is variational")
+    loss: Literal["sum", "mean"] = Field(
+        "sum", description="a head's loss: sum over its image's numbers (literal), or their mean, averaged over a batch"
+    )
     head_weights: dict[str, NotNegative] = Field(
-        default_factory=lambda: dict.fromkeys(HEADS, 1.0), description="weight of each head's loss (plain sum: 1)"
+        default_factory=lambda: dict.fromkeys(HEADS, 1.0), description="further weight of each head's loss (paper: 1)"
     )
     budget: Literal["epochs", "steps"] = Field(
         "epochs", description="at a smaller fraction: same epochs (literal) or same steps"

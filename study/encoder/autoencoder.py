@@ -26,18 +26,26 @@ LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {  # by the name in a he
 class MultiHeadAutoencoder(lightning.LightningModule):
     """An encoder and the decoder heads of a head set, with the loss that trains them (Sec. III-B).
 
-    The loss is the weighted sum over heads of their losses, each a mean over the head's pixels. With `beta` > 0, beta
-    times the Kullback-Leibler divergence of z from N(0, 1) is added, divided by the image's 12,288 numbers, so that
-    beta = 1 is the evidence lower bound of `rec`. Losses are averaged over each epoch and split on the device:
-    Lightning's own logging would wait for it at every step. Raises BadInputError for an unknown head set.
+    The loss adds up the heads' negative log likelihoods, each times its `head_weights`. With the loss "sum", that of an
+    image is the sum over its numbers, as the paper writes it: 12,288 for rec, 4,096 for a mask. The total is divided by
+    4,096, a constant to which Adam is indifferent, so a head's mean per number is weighted by its channels: rec 3, a
+    mask 1. With "mean" each head's mean per number counts alike. With `beta` > 0, beta times the Kullback-Leibler
+    divergence of z from N(0, 1) is added, divided by what rec's likelihood is divided by, so that beta = 1 is the
+    evidence lower bound of `rec` with either loss.
+
+    The losses by head that are logged are means per number, the divergence is per number of rec. They are averaged over
+    each epoch and split on the device: Lightning's own logging would wait for it at every step. Raises BadInputError
+    for an unknown head set.
     """
 
     def __init__(self, heads: str, settings: EncoderSettings, encoder_seed: int) -> None:
         super().__init__()
         if heads not in HEAD_SETS:
             raise one_of("head set", heads, HEAD_SETS)
-        self.settings, self.beta = settings, settings.beta
-        self.head_weights = {head: settings.head_weights.get(head, 1.0) for head in HEAD_SETS[heads].heads}
+        self.settings, self.beta = settings, settings.beta * _numbers("rec", settings)
+        self.head_weights = {
+            head: settings.head_weights.get(head, 1.0) * _numbers(head, settings) for head in HEAD_SETS[heads].heads
+        }
         self.automatic_optimization = False  # gradients come head by head, see `losses`
         self.encoder = Encoder(variational=settings.beta > 0)
         self._head_losses = {head: LOSSES[HEADS[head].loss] for head in self.head_weights}
@@ -149,6 +157,11 @@ class MultiHeadAutoencoder(lightning.LightningModule):
     def not_finite(self, split: Split) -> int:
         """Return the position, since the last reset, of the first batch whose loss was not finite; there is one."""
         return int(torch.stack(self.totals[split]).isfinite().int().argmin())
+
+
+def _numbers(head: str, settings: EncoderSettings) -> int:
+    """Return what a head's mean per number is multiplied by in the loss."""
+    return HEADS[head].channels if settings.loss == "sum" else 1
 
 
 class _Fused:

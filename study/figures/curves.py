@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from study.config.heads import HeadSet
-from study.figures.style import FRACTION_COLOUR, FRACTION_MARKER, GREY, STYLE, look, new_figure
+from study.figures.style import FRACTION_COLOUR, FRACTION_MARKER, GREY, STYLE, literal, look, new_figure
 
 CEILING_LINE, CEILING_WORDS = ":", "true state"
 LATE = 0.05  # share of the epochs after which the axis of a curve shows everything
@@ -190,6 +190,38 @@ def _label_ends(axes: Axes, ends: Sequence[End]) -> None:
 
 def _percent(fraction: object) -> str:
     return f"{float(str(fraction)) * 100:g} %"
+
+
+@mpl.rc_context(STYLE)
+def encoder_losses(lines: Sequence[tuple[str, str, float, pd.Series]], constants: Mapping[str, float]) -> Figure:
+    """Draw what is left to reduce of each head's loss by epoch, one panel for each head.
+
+    `lines`: head, head set, data fraction and values by epoch; the largest fraction is drawn in full colour.
+    `constants`: what a constant picture leaves of each head's loss.
+    """
+    figure, panels = new_figure(2.3, columns=len(constants))
+    top, several = max(line[2] for line in lines), len({line[2] for line in lines}) > 1
+    labelled: dict[str, Any] = {}
+    for axes, (head, constant) in zip(panels, constants.items(), strict=True):
+        for _, name, fraction, values in (line for line in lines if line[0] == head):
+            heads, pale = look(name), fraction < top
+            label = f"{heads.name}, {_percent(fraction)}" if several else heads.name
+            (labelled[label],) = axes.plot(
+                values.index,
+                values,
+                heads.line,
+                color=heads.colour,
+                marker=heads.marker,
+                alpha=0.45 if pale else 1,
+                markevery=max(len(values) // 8, 1),
+            )
+        axes.axhline(constant, color=GREY, linewidth=0.8, linestyle="--")
+        axes.set(yscale="log", title=literal(head), xlabel="encoder epoch")
+    panels[0].set_ylabel("loss to reduce, test")
+    figure.legend(
+        labelled.values(), map(literal, labelled), loc="outside lower center", ncols=min(len(labelled), 4), fontsize=7
+    )
+    return figure
 
 
 @mpl.rc_context(STYLE)

@@ -39,6 +39,7 @@ def draw(record: SweepRecord, report: Report) -> dict[str, Drawing]:
         drawn["by_encoder"] = _encoders(record)
     drawn["paired_differences"] = _differences(report)
     drawn |= {f"confound_{row.setting.replace('.', '_')}": _confound(row) for row in report.confounds}
+    drawn["encoder_losses"] = _encoder_losses(record, report)
     first = _first_results(record, report)
     drawn |= {"latent_maps": _latents(first), **_pictures(first)}
     return {name: figure for name, figure in drawn.items() if figure}
@@ -99,6 +100,21 @@ def _encoders(record: SweepRecord) -> Drawing:
             if fraction == top
         }
     )
+
+
+def _encoder_losses(record: SweepRecord, report: Report) -> Drawing | None:
+    """Draw what is left to reduce of the heads' losses, at the largest and the smallest fraction."""
+    table, ends = record.table(), {report.sweep.fractions[0], report.sweep.fractions[-1]}
+    table = table[(table["stage"] == "encoder") & (table["split"] == "test") & table["fraction"].isin(ends)]
+    means = table.groupby(["heads", "fraction", "metric", "epoch"])["value"].mean()
+    lines, constants = [], {}
+    for score in report.scores:
+        for head, loss in score.losses.items():
+            if score.fraction in ends and math.isfinite(loss["constant"]):
+                values = means[score.heads, score.fraction, f"loss_{head}"] - loss["entropy"]
+                lines.append((head, score.heads, score.fraction, values))
+                constants[head] = loss["constant"] - loss["entropy"]
+    return curves.encoder_losses(lines, constants) if lines else None
 
 
 def _confound(row: VariedSetting) -> Drawing | None:

@@ -76,7 +76,8 @@ class Score(Part):
     `metrics`: final scores by name of the metric; `gain`: accuracy above the floor; `share`: its part of the possible
     gain below a ceiling; `confusion`: the share of each true class (row) that is given each class after the last epoch;
     `components`: standard deviations of accuracy between encoders, policies and epochs; `losses`: those of each head on
-    each split after the last epoch, mean over encoders; `probes`: the share of each quantity's variance that a linear
+    each split after the last epoch, with the entropy of its test targets and the test loss of the constant picture
+    (study.encoder.bounds), mean over encoders; `probes`: the share of each quantity's variance that a linear
     model reads off the latents, mean over encoders.
     """
 

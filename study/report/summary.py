@@ -184,13 +184,18 @@ def _confounds(record: SweepRecord) -> Iterator[VariedSetting]:
 
 
 def _losses(results: list[CellResult]) -> dict[str, dict[str, float]]:
-    """Return the loss of each head on each split after the last epoch, mean over encoders."""
+    """Return the loss of each head on each split after the last epoch, and its bounds, mean over encoders."""
     curves = pd.concat([result.curves for result in results])
     rows = curves[(curves["stage"] == "encoder") & curves["metric"].str.startswith("loss_")]
     last = rows[rows["epoch"] == rows["epoch"].max()].groupby(["metric", "split"])["value"].mean()
     heads = sorted({name.removeprefix("loss_") for name, _ in last.index} - {"kl"})
+    bounds = [result.facts.get("heads", {}) for result in results]
     return {
         head: {split: float(last.get((f"loss_{head}", split), math.nan)) for split in ("train", "test")}
+        | {
+            name: float(np.mean([each.get(head, {}).get(name, math.nan) for each in bounds]))
+            for name in ("entropy", "constant")
+        }
         for head in sorted(heads, key=[*HEADS, *heads].index)
     }
 

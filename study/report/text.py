@@ -70,7 +70,6 @@ def _lists(report: Report) -> dict[str, Any]:
         "unseen": "; ".join(unseen),
         "main": {"about": _about(main), "table": main_scores(report, main)},
         "further": {"about": _about(further), "table": further_scores(report, further)},
-        "trained_heads": list(dict.fromkeys(head for row in report.scores for head in row.losses)),
         "setting": {f"{row.group}.{row.name}": row.value for row in report.settings},
         "labels": [
             (name, "chosen" if kind == "all" else kind, labels)

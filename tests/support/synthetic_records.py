@@ -203,6 +203,7 @@ def simulate_cell(cell, key, settings, world, seeds, rng, labels):
         },
         facts={
             "floor": float(np.bincount(acceleration).max() / FRAMES),
+            "heads": {head: {"entropy": 0.04 * (head == "rec"), "constant": 0.4} for head in heads},
             "frames": {
                 "encoder_train": round(20_000 * cell.fraction),
                 "encoder_test": 5000,
