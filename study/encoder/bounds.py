@@ -48,8 +48,8 @@ def _bounds(frames: Frames, head: str) -> dict[str, float]:
 def _cross_entropy(target: Array, prediction: Array) -> Array:
     """Return the binary cross-entropy, number by number; 0 log 0 is 0."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        parts = target * np.log(prediction), (1 - target) * np.log1p(-prediction)
-    return -sum(np.where(weight > 0, part, 0.0) for weight, part in zip((target, 1 - target), parts, strict=True))
+        ones, zeros = target * np.log(prediction), (1 - target) * np.log1p(-prediction)
+    return -np.where(target > 0, ones, 0.0) - np.where(target < 1, zeros, 0.0)
 
 
 def _moments(frames: Frames, head: str, rows: Indices) -> tuple[Array, Array]:

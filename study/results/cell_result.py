@@ -41,7 +41,8 @@ class CellResult:
     `acceleration_label`, `steering_label`, `episode`, `speed` [m/s], `light` (0 none or green, 1 yellow, 2 red),
     `lead_gap` [m] (NaN: free) [N], and `z` [N, 64] float32 (not normalised).
     `facts`: floor (majority accuracy on test), heads (entropy and constant of each, see
-    `study.encoder.bounds`), frames (counts), seconds per stage, peak_bytes, device, precision, threads, versions: whatever a reader needs to judge the numbers.
+    `study.encoder.bounds`), frames (counts), seconds per stage, peak_bytes, device, precision, threads, versions:
+    whatever a reader needs to judge the numbers.
     """
 
     cell: Cell
