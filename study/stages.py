@@ -141,7 +141,9 @@ def _latents_seconds(work: Work) -> float:
 
 
 def _policy_seconds(work: Work) -> float:
-    return work.policy_seeds * work.settings.policy.epochs * work.settings.frames.policy * POLICY_FRAME_S
+    frames, policy = work.settings.frames, work.settings.policy
+    shown = frames.policy * (frames.test_share + policy.share * (1 - frames.test_share))
+    return work.policy_seeds * policy.epochs * shown * POLICY_FRAME_S
 
 
 def _cell_key(work: Work) -> str:

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 import torch
 
-from study.cell import flow
+from study.cell import flow, stages
 from study.cell.flow import cell_flow, product_folders
 from study.cell.job import CellJob
 from study.config.files import load_profile
@@ -27,9 +27,9 @@ SEEDS = 3
 def new_job(small_store, small_drives, tmp_path):
     """Return a function that makes a job on the small frames, in a scratch folder of its own."""
 
-    def make(cell=REC, **changes):
-        key = cell_key(SETTINGS, cell, SEEDS, open_frames(small_store).key)
-        job = CellJob(cell, key, SETTINGS, SEEDS, small_store, small_drives[0].parent, tmp_path / "scratch", "cpu")
+    def make(cell=REC, settings=SETTINGS, **changes):
+        key = cell_key(settings, cell, SEEDS, open_frames(small_store).key)
+        job = CellJob(cell, key, settings, SEEDS, small_store, small_drives[0].parent, tmp_path / "scratch", "cpu")
         return dataclasses.replace(job, **changes)
 
     return make
@@ -105,6 +105,34 @@ def test_the_ceiling_has_neither_encoder_nor_network(new_job, small_drives):
     assert set(result.curves["stage"]) == {"policy"}
     assert result.facts["seconds"]["encoder"] == 0
     assert np.isfinite(result.curves["value"]).all()
+
+
+def test_policies_that_are_given_speeds_have_no_network_that_images_could_drive(new_job, small_drives):
+    settings = SETTINGS.model_copy(update={"policy": SETTINGS.policy.model_copy(update={"inputs": "z+speed"})})
+    for cell in (REC, CEILING):
+        result, network, _ = run(new_job(cell, settings, drives=small_drives[3].parent))
+        assert result.policies["steering_0_weight"].shape == (SEEDS, 74, 256)
+        assert result.predictions["z"].shape[1] == 64
+        assert network == b""
+        speeds = result.policies["z_mean"][64:]  # on average, that of now is hardly another than that of 0.1 s ago
+        assert speeds.min() > 0
+        assert np.abs(np.diff(speeds)).max() < 1
+
+
+def test_policies_on_a_share_learn_from_nested_parts_and_meet_the_same_test_frames(new_job):
+    def ignore(*_):
+        pass
+
+    sets = []
+    for share in (1.0, 0.6, 0.4):
+        policy = SETTINGS.policy.model_copy(update={"share": share, "batch": 4})
+        job = new_job(settings=SETTINGS.model_copy(update={"policy": policy}))
+        sets.append(stages.encode_policy_set(job, stages.train_cell_encoder(job, ignore), ignore))
+    trained = [{row.tobytes() for row in each.z_train} for each in sets]
+    assert trained[0] > trained[1] > trained[2]
+    assert [len(each.z_train) for each in sets] == [round(share * len(sets[0].z_train)) for share in (1, 0.6, 0.4)]
+    for each in sets[1:]:
+        assert each.z_test.tobytes() == sets[0].z_test.tobytes()
 
 
 def test_facts_say_what_computed(new_job):

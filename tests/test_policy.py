@@ -13,7 +13,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from study.config.settings import PolicySettings
+from study.config.settings import SPEEDS, PolicySettings
 from study.errors import BadInputError, TrainingDivergedError
 from study.policy import ensemble
 from study.policy.draws import draw_epoch, initial_weights
@@ -405,6 +405,26 @@ def test_predict_knows_how_z_was_scaled(how: Any) -> None:
     policies = train(settings=SETTINGS.model_copy(update={"normalise": how}))
     steering, _ = predict(policies.weights, drive(TEST, 2)[0])
     np.testing.assert_allclose(steering, policies.steering, rtol=1e-4, atol=1e-5)
+
+
+def test_policies_that_are_given_speeds_read_them_and_start_from_their_own_seed() -> None:
+    """Labels that only the ten further numbers tell: learned with them, not without."""
+    settings = SETTINGS.model_copy(update={"inputs": "z+speed", "epochs": 20})
+    rng = np.random.default_rng(4)
+    sets = []
+    for frames in (TRAIN, TEST):
+        z, speeds = rng.normal(size=(frames, 64)), rng.normal(5, 2, size=(frames, SPEEDS))
+        labels = pd.DataFrame({"steering": np.zeros(frames), "acceleration": np.digitize(speeds[:, 0], [4, 6])})
+        sets.append((np.column_stack([z, speeds]).astype(np.float32), labels))
+    (train_x, train_labels), (test_x, test_labels) = sets
+    given = train_policies(train_x, test_x, train_labels, test_labels, [0, 1], settings)
+    alone = train_policies(train_x, test_x, train_labels, test_labels, [1], settings)
+    blind = train_policies(train_x[:, :64], test_x[:, :64], train_labels, test_labels, [0, 1], SETTINGS)
+    assert given.weights["acceleration_0_weight"].shape == (2, settings.width, 128)
+    np.testing.assert_array_equal(given.steering[1], alone.steering[0])
+    np.testing.assert_allclose(predict(given.weights, test_x)[0], given.steering, rtol=1e-4, atol=1e-5)
+    accuracies = [(each.acceleration == test_labels["acceleration"].to_numpy()).mean() for each in (given, blind)]
+    assert accuracies[0] > accuracies[1] + 0.2
 
 
 # --- what cannot be done --------------------------------------------------------------------------------------------

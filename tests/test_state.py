@@ -8,6 +8,7 @@ import pytest
 
 from study.config.keys import FORMAT_VERSIONS
 from study.config.settings import BirdviewSettings, FramesSettings
+from study.data.past_speeds import past_speeds
 from study.data.selection import candidates
 from study.data.true_state import true_state
 from study.episode.files import read_episode
@@ -71,6 +72,18 @@ def test_no_number_of_a_test_frame_is_used_for_scaling(state, labels, sources, f
     other = labels.assign(speed=labels["speed"].where(labels["train"], 3.0))
     train = labels["train"].to_numpy()
     assert np.array_equal(true_state(other, sources, folder)[train], state[train])
+
+
+def test_past_speeds_are_those_of_the_drives_and_begin_with_the_label(labels, sources, folder):
+    """A step before the drive began counts as unchanged."""
+    episodes = [read_episode(folder / source["name"]) for source in sources]
+    speeds = past_speeds(labels, sources, folder, range(10))
+    np.testing.assert_allclose(speeds[:, 0], labels["speed"], rtol=1e-6)
+    expected = [
+        episodes[row.episode].speed[row.step - 9, row.agent - 100] if row.step >= 9 else row.speed
+        for row in labels.itertuples()
+    ]
+    np.testing.assert_allclose(speeds[:, 9], expected, rtol=1e-6)
 
 
 def test_other_drives_than_the_frames_were_made_from_are_refused(labels, sources, folder, tmp_path):

@@ -18,7 +18,10 @@ from study.compute.device import choose_device, describe_determinism, device_nam
 from study.compute.provenance import provenance
 from study.config.heads import load_heads
 from study.config.keys import cell_key
+from study.config.paper import LATENT
+from study.config.settings import SPEEDS
 from study.data.frames import FrameStore, open_frames
+from study.data.past_speeds import past_speeds
 from study.data.prepare import data_flow
 from study.data.true_state import true_state
 from study.driving.driver import export_driver
@@ -40,7 +43,10 @@ Reporter = Callable[..., None]  # see `Task`
 
 @dataclass(frozen=True)
 class Latents:
-    """The policy set as policies see it: z [N, 64] float32 and labels of both splits, and the stage's facts."""
+    """The policy set as policies see it: z [N, 64] float32 and labels of both splits, and the stage's facts.
+
+    With `policy.inputs` z+speed, past speeds [m/s] follow the 64 numbers.
+    """
 
     z_train: NDArray[np.float32]
     z_test: NDArray[np.float32]
@@ -76,13 +82,17 @@ def encode_policy_set(job: CellJob, encoder: Product | None, report: Reporter) -
     started = time.perf_counter()
     store, device, facts = _begin(job, report)
     policy = store.policy
-    rows = {split: policy.indices(split) for split in ("train", "test")}
+    part = policy.subset(job.settings.policy.share, "frame", job.settings.frames.seed)
+    rows = {"train": part, "test": policy.indices("test")}
     if encoder is None:
         state = true_state(policy.labels, store.manifest["sources"]["policy"], job.drives)
         z = {split: state[indices] for split, indices in rows.items()}
     else:
         weights = encoder.parts["weights"]
         z = {split: encode(weights, policy.images, indices, device=device) for split, indices in rows.items()}
+    if job.settings.policy.inputs == "z+speed":
+        speeds = past_speeds(policy.labels, store.manifest["sources"]["policy"], job.drives, range(SPEEDS))
+        z = {split: np.column_stack([z[split], speeds[rows[split]].astype(np.float32)]) for split in rows}
     labels = {split: policy.labels.iloc[indices].reset_index(drop=True) for split, indices in rows.items()}
     facts |= {"encoder_test": len(store.encoder.indices("test"))}
     facts |= {"seconds": time.perf_counter() - started, "peak_bytes": peak_bytes()}
@@ -143,7 +153,7 @@ def assemble_result(
             "steering_label": labels["steering"].to_numpy(np.float32),
             "episode": labels["episode"].to_numpy(np.int32),
             **{name: labels[name].to_numpy() for name in PROBED},
-            "z": latents.z_test,
+            "z": latents.z_test[:, :LATENT],
         },
         facts={
             "floor": float(np.bincount(labels["acceleration"]).max() / len(labels)),

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from study.config.heads import HEADS
-from study.config.paper import IMAGE
+from study.config.paper import IMAGE, LATENT
 
 
 class Settings(BaseModel):
@@ -35,6 +35,7 @@ Share = Annotated[float, Field(ge=0, le=1)]
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Count = Annotated[int, Field(ge=1)]
+SPEEDS = 10  # past speeds that a policy may be given: now and 0.1 s to 0.9 s ago
 
 
 class TownSettings(Settings):
@@ -141,6 +142,17 @@ class PolicySettings(Settings):
     batch: Annotated[int, Field(ge=2)] = Field(512, description="batch size (Sec. IV-C: 2048)")
     lr: Positive = Field(5e-4, description="Adam's learning rate (Sec. IV-C: '5^{-4}', read as 5e-4)")
     normalise: Literal["zscore", "l2", "none"] = Field("zscore", description="how z is normalised (Sec. IV-C)")
+    inputs: Literal["z", "z+speed"] = Field(
+        "z", description="z+speed: beside z, the true speeds of the past second, 0.1 s apart (a control)"
+    )
+    share: Annotated[float, Field(gt=0, le=1)] = Field(
+        1.0, description="share of the policy set's training frames that policies learn from; nested random subsets"
+    )
+
+    @property
+    def width(self) -> int:
+        """Return how many numbers a policy is given."""
+        return LATENT + (SPEEDS if self.inputs == "z+speed" else 0)
 
 
 class StudySettings(Settings):

@@ -15,9 +15,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from study.config.paper import LATENT
-from study.episode.files import read_episode
-from study.episode.head import episode_digest
-from study.errors import BadInputError
+from study.data.past_speeds import past_speeds
 
 PAST = 10  # steps at 10 Hz: the past second
 FAR = 40.0  # [m] the image's side; what is farther away, or absent, counts as this far
@@ -41,7 +39,7 @@ def true_state(labels: pd.DataFrame, sources: Sequence[Mapping[str, str]], drive
         parts += [] if name == "speed" else [np.isnan(values_of[name])[:, None]]
         high = float(values_of[name][train].max()) if name == "speed" else FAR
         parts.append(_ramps(np.nan_to_num(values_of[name], nan=FAR), high, count))
-    parts.append(values_of["speed"][:, None] - _past_speed(labels, sources, drives))
+    parts.append(values_of["speed"][:, None] - past_speeds(labels, sources, drives, range(1, PAST + 1)))
     values = np.concatenate(parts, axis=1).astype(np.float64)
     spread = values[train].std(axis=0)
     scaled = (values - values[train].mean(axis=0)) / np.where(spread > 0, spread, 1.0)
@@ -51,23 +49,3 @@ def true_state(labels: pd.DataFrame, sources: Sequence[Mapping[str, str]], drive
 def _ramps(values: Array, high: float, count: int) -> Array:
     """Return [N, count]: the part of each of `count` equal stretches from 0 to `high` that a value covers."""
     return np.clip(values[:, None] * (count / max(high, 1e-9)) - np.arange(count), 0, 1)
-
-
-def _past_speed(labels: pd.DataFrame, sources: Sequence[Mapping[str, str]], drives: Path) -> Array:
-    """Return the speed 1 to PAST steps before each frame [N, PAST]; an unrecorded speed counts as unchanged."""
-    past = np.empty((len(labels), PAST))
-    for number, rows in labels.reset_index(drop=True).groupby("episode"):
-        source = sources[int(str(number))]
-        folder = drives / Path(source["name"]).name
-        if not (folder / "episode.json").is_file() or episode_digest(folder) != source["digest"]:
-            raise BadInputError(
-                f"the ceiling needs the drives that the frames were made from, and {folder} is missing or has changed; "
-                "delete the frame store to make both again, or leave the ceiling out with --ceiling false"
-            )
-        episode = read_episode(folder)
-        column = {agent.id: place for place, agent in enumerate(episode.agents)}
-        columns = rows["agent"].map(column).to_numpy()[:, None]
-        steps = rows["step"].to_numpy()[:, None] - np.arange(1, PAST + 1)
-        speed = np.where(steps < 0, np.nan, episode.speed[np.maximum(steps, 0), columns])
-        past[rows.index] = np.where(np.isnan(speed), rows["speed"].to_numpy()[:, None], speed)
-    return past

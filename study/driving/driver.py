@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from study.config.paper import LATENT
 from study.encoder.inputs import to_float
 from study.encoder.latents import encoder_of
 from study.policy.networks import WIDTHS, through
@@ -55,7 +56,12 @@ class Driver(nn.Module):
 
 
 def export_driver(result: CellResult) -> bytes:
-    """Return the cell's Driver as a .pt2 archive that takes batches of any size, in about a second."""
+    """Return the cell's Driver as a .pt2 archive that takes batches of any size, in about a second.
+
+    Empty where policies were given more than images show (`policy.inputs`).
+    """
+    if len(result.policies["z_mean"]) != LATENT:
+        return b""
     driver = Driver(result.encoder, result.policies).eval()
     images = to_float(torch.from_numpy(result.samples["input"][:1])).repeat(2, 1, 1, 1)  # one would become a constant
     with torch.no_grad():

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from study.config.paper import LATENT
 from study.policy.networks import WIDTHS, WORD, slots
 from study.randomness import rng
 
@@ -42,10 +43,10 @@ def draw_epoch(seeds: Sequence[int], epoch: int, frames: int, device: torch.devi
     return Draws(order.to(device, non_blocking=True), {name: (next(parts), next(parts)) for name in WIDTHS})
 
 
-def initial_weights(seed: int) -> Iterator[tuple[str, Tensor]]:
+def initial_weights(seed: int, inputs: int = LATENT) -> Iterator[tuple[str, Tensor]]:
     """Yield one policy's weights by name, as torch's Linear draws them: uniform within 1 / sqrt(inputs)."""
     generator = rng(seed, "policy weights")
     for name, widths in WIDTHS.items():
-        for slot in slots(name):
-            bound = widths[slot.layer] ** -0.5
+        for slot in slots(name, inputs):
+            bound = (inputs, *widths[1:])[slot.layer] ** -0.5
             yield slot.key, torch.from_numpy(generator.uniform(-bound, bound, slot.shape).astype(np.float32))

@@ -8,7 +8,8 @@ A unit of work is one network on a group of seeds. On a CPU a group is one seed,
 computed on one thread: threads inside an operation would wait for each other forty times a step. On a GPU all seeds are
 one group.
 
-Suffixes: S seeds, G seeds of a group, B rows of a batch, N frames, H hidden units, O outputs, Z = 64 latent numbers.
+Suffixes: S seeds, G seeds of a group, B rows of a batch, N frames, H hidden units, O outputs, Z numbers given: 64 of
+the latent, and past speeds where the settings say so.
 """
 
 from __future__ import annotations
@@ -23,7 +24,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from study.config.paper import LATENT
 from study.config.settings import PolicySettings
 from study.policy.draws import Draws, draw_epoch, initial_weights
 from study.policy.latents import Arrays
@@ -35,7 +35,7 @@ AfterEpoch = Callable[[int, Arrays], None]
 
 @dataclass(frozen=True)
 class PolicyData:
-    """The data of policies: `x` [N, 64], normalised, and `labels` of the train split.
+    """The data of policies: `x` [N, Z], normalised, and `labels` of the train split.
 
     `views`: for each split the x and labels that metrics are taken on.
     """
@@ -59,7 +59,7 @@ class PolicyEnsemble(lightning.LightningModule):
         self.automatic_optimization = False
         self.seeds, self.settings = tuple(seeds), settings
         self._data, self._after_epoch = data, after_epoch
-        self.stacks = nn.ParameterDict({name: nn.Parameter(stack(seeds, name)) for name in WIDTHS})
+        self.stacks = nn.ParameterDict({name: nn.Parameter(stack(seeds, name, data.x.shape[1])) for name in WIDTHS})
         self._scratch = Scratch()
         self._ahead: Draws | None = None
         self._groups = _groups(len(self.seeds), data.x.device)
@@ -77,7 +77,7 @@ class PolicyEnsemble(lightning.LightningModule):
         if weights.grad is None:
             weights.grad = torch.zeros_like(weights)
         rows, gradients = weights.detach()[group], weights.grad[group]
-        places = slots(name)
+        places = slots(name, self._data.x.shape[1])
         return [
             Layer(weight.cut(rows), bias.cut(rows)[:, None], weight.cut(gradients), bias.cut(gradients)[:, None])
             for weight, bias in zip(places[::2], places[1::2], strict=True)
@@ -88,7 +88,7 @@ class PolicyEnsemble(lightning.LightningModule):
         return {
             slot.key: np.ascontiguousarray(slot.cut(self.stacks[name].detach()).cpu().numpy())
             for name in WIDTHS
-            for slot in slots(name)
+            for slot in slots(name, self._data.x.shape[1])
         }
 
     def on_train_epoch_start(self) -> None:
@@ -113,7 +113,7 @@ class PolicyEnsemble(lightning.LightningModule):
     def _pass(self, name: str, index: int, rows: slice) -> None:
         group, count = self._groups[index], rows.stop - rows.start
         order = self._order[group, rows]
-        x = self._scratch.take("x", (order.numel(), LATENT), self._data.x)
+        x = self._scratch.take("x", (order.numel(), self._data.x.shape[1]), self._data.x)
         torch.index_select(self._data.x, 0, order.reshape(-1), out=x)
         frames = len(self._data.x)
         words = []
@@ -124,7 +124,7 @@ class PolicyEnsemble(lightning.LightningModule):
         labels = (self._steering if name == "steering" else self._acceleration)[group, None, rows]
         forward_backward(
             self._layers[name][index],
-            x.view(len(order), count, LATENT),
+            x.view(len(order), count, -1),
             words,
             lambda outputs: gradient(outputs, labels),
             self._scratch,
@@ -169,17 +169,17 @@ def _acceleration_gradient(logits: Tensor, labels: Tensor) -> Tensor:
     return gradient.div_(logits.shape[2])
 
 
-def stack(seeds: Sequence[int], name: str) -> Tensor:
+def stack(seeds: Sequence[int], name: str, inputs: int) -> Tensor:
     """Return the initial weights of all seeds [S, numbers], rows padded to full vectors of the processor.
 
     Adam would round the numbers of a last, half-filled vector differently, and a seed's result would depend on its
     place in the stack.
     """
-    places = slots(name)
+    places = slots(name, inputs)
     used = places[-1].start + math.prod(places[-1].shape)
     rows = torch.zeros(len(seeds), math.ceil(used / VECTOR) * VECTOR)
     for row, seed in enumerate(seeds):
-        start = dict(initial_weights(seed))
+        start = dict(initial_weights(seed, inputs))
         for slot in places:
             slot.cut(rows[row : row + 1]).copy_(start[slot.key][None])
     return rows

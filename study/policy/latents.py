@@ -8,14 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from study.config.paper import LATENT
-
 Arrays = dict[str, NDArray[Any]]
 
 
 def normalisation(z_train: NDArray[np.float32], how: str) -> Arrays:
     """Return the numbers that `normalise` needs, from the policy train split only (docs/paper.md)."""
-    mean, std = np.zeros(LATENT, np.float32), np.ones(LATENT, np.float32)
+    mean, std = np.zeros(z_train.shape[1], np.float32), np.ones(z_train.shape[1], np.float32)
     if how == "zscore":
         mean, std = z_train.mean(0, dtype=np.float64), z_train.std(0, dtype=np.float64)
         std = np.where(std > 0, std, 1.0)  # a dead latent number stays 0
@@ -27,7 +25,7 @@ def normalisation(z_train: NDArray[np.float32], how: str) -> Arrays:
 
 
 def normalise(weights: Mapping[str, NDArray[Any]], z: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the latent [N, 64] as the policies see it."""
+    """Return what policies are given [N, Z] as they see it."""
     scaled: NDArray[np.float32] = (z - weights["z_mean"]) / weights["z_std"]
     if weights["z_l2"][0]:
         scaled /= np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), np.finfo(np.float32).tiny)

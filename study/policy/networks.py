@@ -16,7 +16,7 @@ from torch import Tensor
 from study.config.paper import ACCELERATION_HIDDEN, ACCELERATIONS, DROPOUT, LATENT, STEERING_HIDDEN
 from study.policy.latents import normalise
 
-WIDTHS = {
+WIDTHS = {  # of a policy that is given z alone
     "steering": (LATENT, *STEERING_HIDDEN, 1),
     "acceleration": (LATENT, *ACCELERATION_HIDDEN, len(ACCELERATIONS)),
 }
@@ -43,11 +43,11 @@ class Slot(NamedTuple):
         return rows[:, self.start : self.start + math.prod(self.shape)].view(-1, *self.shape)
 
 
-def slots(name: str) -> list[Slot]:
-    """Return the weights and biases of a network in their order, layer by layer."""
+def slots(name: str, inputs: int = LATENT) -> list[Slot]:
+    """Return the weights and biases of a network of so many inputs in their order, layer by layer."""
     places, start = [], 0
-    for layer, (inputs, outputs) in enumerate(itertools.pairwise(WIDTHS[name])):
-        for part, shape in (("weight", (inputs, outputs)), ("bias", (outputs,))):
+    for layer, (before, after) in enumerate(itertools.pairwise((inputs, *WIDTHS[name][1:]))):
+        for part, shape in (("weight", (before, after)), ("bias", (after,))):
             places.append(Slot(f"{name}_{layer}_{part}", layer, start, shape))
             start += math.prod(shape)
     return places

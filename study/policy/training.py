@@ -16,7 +16,7 @@ from torch import Tensor
 
 from study.compute.device import keep_memory
 from study.compute.trainer import trainer
-from study.config.paper import ACCELERATIONS, LATENT
+from study.config.paper import ACCELERATIONS
 from study.config.settings import PolicySettings
 from study.errors import BadInputError, TrainingDivergedError
 from study.policy.ensemble import PolicyData, PolicyEnsemble
@@ -27,7 +27,7 @@ from study.results.cell_result import CURVE_COLUMNS
 
 Log = Callable[[int, dict[str, float]], None]
 Progress = Callable[[int, int], None]
-Labelled = tuple[NDArray[np.float32], pd.DataFrame]  # latents [N, 64] and their labels
+Labelled = tuple[NDArray[np.float32], pd.DataFrame]  # latents [N, Z] and their labels
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class TrainedPolicies:
     """S trained policies and their curves; N test frames.
 
     `weights`: "<network>_<layer>_weight" [S, in, out] and "..._bias" [S, out] float32 for networks "steering" and
-    "acceleration", layers 0 to 2; "z_mean", "z_std" [64]; "z_l2" [1] uint8: 1 where z is scaled to unit length.
+    "acceleration", layers 0 to 2; "z_mean", "z_std" [Z]; "z_l2" [1] uint8: 1 where z is scaled to unit length.
     `curves`: one row per measured point, columns CURVE_COLUMNS, of the policies without dropout after each epoch.
     `acceleration` [S, N] uint8 class and `steering` [S, N] float32: on the test frames after the last epoch.
     """
@@ -59,10 +59,11 @@ def train_policies(
     log: Log | None = None,
     progress: Progress | None = None,
 ) -> TrainedPolicies:
-    """Train one policy per seed on latents [N, 64] float32 and labels with columns "steering" and "acceleration".
+    """Train one policy per seed on latents and labels with columns "steering" and "acceleration".
 
-    Train metrics are taken on a random part of the train split, the same for all seeds and epochs, that is no larger
-    than the test split. `log(epoch, means over the seeds)` with names such as "test/acceleration_accuracy".
+    Latents are [N, Z] float32 with the Z of `settings.width`. Train metrics are taken on a random part of the train
+    split, the same for all seeds and epochs, that is no larger than the test split.
+    `log(epoch, means over the seeds)` with names such as "test/acceleration_accuracy".
     Raises BadInputError for data that cannot be learnt from, TrainingDivergedError for a loss that is not finite.
     """
     started = time.perf_counter()
@@ -150,8 +151,10 @@ def _check(
     if not seeds or len(set(seeds)) != len(seeds):
         raise BadInputError(f"policy seeds {list(seeds)}: at least one is needed, and each once")
     for split, z, labels in (("train", z_train, labels_train), ("test", z_test, labels_test)):
-        if z.ndim != 2 or z.shape[1] != LATENT or not len(z) or z.dtype != np.float32:
-            raise BadInputError(f"{split} latents are {z.dtype} {list(z.shape)}; float32 [frames, {LATENT}] is needed")
+        if z.ndim != 2 or z.shape[1] != settings.width or not len(z) or z.dtype != np.float32:
+            raise BadInputError(
+                f"{split} latents are {z.dtype} {list(z.shape)}; float32 [frames, {settings.width}] is needed"
+            )
         if not np.isfinite(z).all():
             raise BadInputError(f"{split} latents hold values that are not finite; train the encoder again")
         values = labels[["steering", "acceleration"]].to_numpy(np.float64)

@@ -1,0 +1,41 @@
+"""True speeds of the past second, from the drives that frames were made from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from study.episode.files import read_episode
+from study.episode.head import episode_digest
+from study.errors import BadInputError
+
+
+def past_speeds(
+    labels: pd.DataFrame, sources: Sequence[Mapping[str, str]], drives: Path, steps: Sequence[int]
+) -> NDArray[np.float64]:
+    """Return the speed that many steps of 0.1 s before each frame [N, len(steps), m/s]; an unrecorded one is unchanged.
+
+    `sources` lists the set's drives, name and digest, as a frame store's manifest does; they lie in `drives`.
+    Raises BadInputError when a drive is missing or has changed.
+    """
+    past = np.empty((len(labels), len(steps)))
+    for number, rows in labels.reset_index(drop=True).groupby("episode"):
+        source = sources[int(str(number))]
+        folder = drives / Path(source["name"]).name
+        if not (folder / "episode.json").is_file() or episode_digest(folder) != source["digest"]:
+            raise BadInputError(
+                f"true speeds need the drives that the frames were made from, and {folder} is missing or has changed; "
+                "delete the frame store to make both again, or leave out what needs them: --ceiling false, "
+                "--policy.inputs z"
+            )
+        episode = read_episode(folder)
+        column = {agent.id: place for place, agent in enumerate(episode.agents)}
+        columns = rows["agent"].map(column).to_numpy()[:, None]
+        times = rows["step"].to_numpy()[:, None] - np.asarray(steps)
+        speed = np.where(times < 0, np.nan, episode.speed[np.maximum(times, 0), columns])
+        past[rows.index] = np.where(np.isnan(speed), rows["speed"].to_numpy()[:, None], speed)
+    return past
