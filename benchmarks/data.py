@@ -34,7 +34,7 @@ from study.config.paper import IMAGE
 from study.config.settings import StudySettings
 from study.data.birdview import Renderer, valid_moments
 from study.episode.files import read_episode, write_episode
-from study.sim.autopilot import DT
+from study.sim.dynamics import DT
 from study.sim.env import Traffic, make_traffic
 from study.sim.record import record_episode
 from study.stages import size_text
@@ -88,7 +88,7 @@ def one_round(settings: StudySettings, seed: int) -> dict[str, float]:
     """Rates of every stage on the town of that seed."""
     t: Timed = {}
     cpu, wall = time.process_time, time.perf_counter
-    ours, stock = (make_traffic(settings.town, seed) for _ in range(2))
+    ours, stock = (make_traffic(settings.town, seed, settings.dynamics) for _ in range(2))
     for road in (ours, stock):
         drive(road, WARM_UP)
     stock.network.fast = False
@@ -97,7 +97,9 @@ def one_round(settings: StudySettings, seed: int) -> dict[str, float]:
     if not np.array_equal(mine, theirs):
         raise SystemExit(f"town {seed}: the two ways have driven apart")
 
-    episode = timed("record", t, cpu, lambda: record_episode(settings.town, settings.recording, seed))
+    episode = timed(
+        "record", t, cpu, lambda: record_episode(settings.town, settings.dynamics, settings.recording, seed)
+    )
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch) / episode.id
         timed("write", t, wall, lambda: write_episode(episode, folder))

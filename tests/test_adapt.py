@@ -20,7 +20,6 @@ from study.episode.head import file_digest
 from study.episode.imported import open_import
 from study.episode.importing import import_drives
 from study.errors import BadInputError
-from study.sim import autopilot
 from study.sim.record import record_episode
 from study.sweep.plan import make_plan
 from tests.support.drives import crossing_drive, write_drives
@@ -35,7 +34,7 @@ def drive():
 def town():
     """Return a drive of our town, whose commands are known."""
     settings = load_profile("smoke", {"town": {"vehicles": 30}, "recording": {"warm_up": 4, "duration": 8}})
-    return record_episode(settings.town, settings.recording, 3)
+    return record_episode(settings.town, settings.dynamics, settings.recording, 3)
 
 
 @pytest.fixture
@@ -90,8 +89,8 @@ def test_an_agent_is_there_between_steps_only_if_it_is_at_both(drive):
     assert np.flatnonzero(adapted.present[:, 0]).max() == 38
 
 
-def test_the_steering_unit_is_the_towns():
-    assert STEERING_UNIT == autopilot.STEERING_UNIT
+def test_the_steering_unit_is_the_towns(town):
+    assert town.source["steering_unit"] == STEERING_UNIT
 
 
 def test_derived_commands_are_those_of_the_autopilot(town):

@@ -90,6 +90,17 @@ def test_more_drives_keep_existing_drives():
     assert recording_key(StudySettings()) == recording_key(changed(recording={"encoder_episodes": 99}))
 
 
+def test_how_vehicles_answer_and_the_one_town_are_part_of_the_drives():
+    one = recording_key(StudySettings())
+    assert one != recording_key(changed(dynamics={"lag": 0.4}))
+    assert one != recording_key(changed(recording={"seed": 1}))  # the town is drawn from it
+
+
+def test_the_first_seed_does_not_matter_where_each_drive_has_a_town_of_its_own():
+    keys = {recording_key(changed(town={"per_drive": True}, recording={"seed": seed})) for seed in (0, 1)}
+    assert len(keys) == 1
+
+
 def test_policy_settings_leave_the_encoder_as_it_is():
     cell, one, other = Cell(heads="full"), StudySettings(), changed(policy={"lr": 0.1})
     assert encoder_key(one, cell, "f") == encoder_key(other, cell, "f")

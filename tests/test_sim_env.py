@@ -9,9 +9,10 @@ from gymnasium.utils.env_checker import check_env
 from highway_env.road.road import RoadNetwork
 
 from study.config.paper import ACCELERATIONS
-from study.config.settings import TownSettings
+from study.config.settings import DynamicsSettings, TownSettings
 from study.errors import BadInputError
-from study.sim.autopilot import DT, REACH
+from study.sim.autopilot import REACH
+from study.sim.dynamics import DT
 from study.sim.env import EGO, TownEnv, Traffic, make_traffic
 
 SMALL = TownSettings(rows=3, columns=3, dropped_edges=0, vehicles=12)
@@ -81,6 +82,13 @@ def test_a_crash_costs_and_ends_the_episode() -> None:
     assert terminated
 
 
+def test_settings_may_be_given_as_plain_values() -> None:
+    env = TownEnv({"town": SMALL.model_dump(), "dynamics": {"steering_unit": 0.5}, "seed": 2})
+    assert env.action_space[1].high == pytest.approx(np.pi / 3 / 0.5)
+    env.step((1, np.array([0.2], np.float32)))
+    assert env.road.wheel[EGO] == pytest.approx(-0.1)
+
+
 def test_towns_without_room_for_the_vehicles_are_refused() -> None:
     with pytest.raises(BadInputError, match="take at most"):
         make_traffic(TownSettings(rows=3, columns=3, dropped_edges=0, vehicles=5000), 0)
@@ -136,8 +144,8 @@ def test_vehicles_near_each_other_are_the_same(both: tuple[Traffic, Traffic]) ->
 
 
 def test_drives_with_highway_envs_own_look_ups_are_equal_bit_for_bit() -> None:
-    settings = TownSettings(vehicles=20)
-    fast, stock = make_traffic(settings, 3), make_traffic(settings, 3, fast=False)
+    settings, dynamics = TownSettings(vehicles=20, per_drive=True), DynamicsSettings(lag=0.3, wheel_lag=0.1)
+    fast, stock = (make_traffic(settings, 3, dynamics, fast=fast) for fast in (True, False))
     for step in range(60):
         for road in (fast, stock):
             road.commands = {0: (ACCELERATIONS[2], 0.0)}  # straight on, off its lane sooner or later

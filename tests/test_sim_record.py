@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from study.config.paper import ACCELERATIONS
-from study.config.settings import RecordingSettings, TownSettings
+from study.config.settings import DynamicsSettings, RecordingSettings, TownSettings
+from study.data.prepare import POLICY_SEED
 from study.engine.flows import run_flow
 from study.episode.checks import check_episode
 from study.episode.files import read_episode
@@ -18,12 +19,13 @@ from study.sim.record import FORMAT_VERSION, record_episode, record_flow
 
 TOWN = TownSettings(vehicles=30)
 TINY = TownSettings(rows=3, columns=3, dropped_edges=0, vehicles=6)
+AT_ONCE = DynamicsSettings()
 SHORT = RecordingSettings(warm_up=1.0, duration=1.5)
 
 
 @pytest.fixture(scope="module")
 def episode() -> Episode:
-    return record_episode(TOWN, RecordingSettings(warm_up=3.0, duration=20.0), 7)
+    return record_episode(TOWN, AT_ONCE, RecordingSettings(warm_up=3.0, duration=20.0), 7)
 
 
 def test_an_episode_of_the_town_is_valid_and_says_what_wrote_it(episode: Episode) -> None:
@@ -34,7 +36,9 @@ def test_an_episode_of_the_town_is_valid_and_says_what_wrote_it(episode: Episode
     assert episode.source["writer"] == "study.sim"
     assert episode.source["format_version"] == FORMAT_VERSION
     assert episode.source["seed"] == 7
+    assert episode.source["town_seed"] == 0
     assert TownSettings.model_validate(episode.source["town"]) == TOWN
+    assert DynamicsSettings.model_validate(episode.source["dynamics"]) == AT_ONCE
     traffic = episode.source["traffic"]
     assert traffic["collided_vehicles"] == 0
     assert traffic["mean_speed"] == pytest.approx(float(episode.speed[episode.present].mean()), abs=0.01)
@@ -42,14 +46,14 @@ def test_an_episode_of_the_town_is_valid_and_says_what_wrote_it(episode: Episode
 
 
 def test_recording_again_gives_the_same_bits(episode: Episode) -> None:
-    again = record_episode(TOWN, RecordingSettings(warm_up=3.0, duration=20.0), 7)
+    again = record_episode(TOWN, AT_ONCE, RecordingSettings(warm_up=3.0, duration=20.0), 7)
     for name in ("x", "y", "heading", "speed", "steering", "acceleration", "light", "light_state", "lead_gap"):
         assert getattr(again, name).tobytes() == getattr(episode, name).tobytes()
     assert [route.tobytes() for route in again.routes] == [route.tobytes() for route in episode.routes]
 
 
 def test_a_longer_warm_up_only_shifts_the_drive(episode: Episode) -> None:
-    later = record_episode(TOWN, RecordingSettings(warm_up=8.0, duration=5.0), 7)
+    later = record_episode(TOWN, AT_ONCE, RecordingSettings(warm_up=8.0, duration=5.0), 7)
     assert np.array_equal(later.x, episode.x[50:100])
 
 
@@ -137,18 +141,36 @@ def test_the_drive_of_a_seed_is_the_one_that_its_format_version_stands_for() -> 
     """Change FORMAT_VERSIONS["episodes"] with this digest, or drives of old and new code pass for the same."""
     town = TownSettings(rows=3, columns=4, dropped_edges=1, vehicles=20)
     tiny = record_episode(
-        town, RecordingSettings(warm_up=1.0, duration=20.0), 1
+        town, DynamicsSettings(lag=0.4, wheel_lag=0.1), RecordingSettings(warm_up=1.0, duration=20.0), 1
     )  # long enough for lights, queues and crossings
     rounded = [np.round(getattr(tiny, name), 2) + 0.0 for name in ("x", "y", "speed", "acceleration")]
     digest = hashlib.sha256(b"".join(values.tobytes() for values in rounded)).hexdigest()
-    assert (FORMAT_VERSION, digest[:16]) == (2, "8535a611e3e78b1a")
+    assert (FORMAT_VERSION, digest[:16]) == (3, "a09a5cb8c694cdfc")
 
 
 def test_recordings_that_cannot_be_are_refused(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="shorter than one step"):
-        record_episode(TINY, RecordingSettings(warm_up=0, duration=0.01), 0)
-    with pytest.raises(BadInputError, match="speed_limit"):
-        run_flow(record_flow(TownSettings(speed_limit=200.0), SHORT, [0], tmp_path))
+        record_episode(TINY, AT_ONCE, RecordingSettings(warm_up=0, duration=0.01), 0)
+    with pytest.raises(
+        BadInputError,
+        match=r"dynamics.lag: with 3 s, stopping from 45 km/h takes .* looks 30 m ahead; take a lag of at most",
+    ):
+        run_flow(record_flow(TownSettings(speed_limit=45.0), DynamicsSettings(lag=3), SHORT, [0], tmp_path))
+
+
+def test_all_drives_are_in_one_town_unless_each_is_to_have_its_own() -> None:
+    def drive(seed: int, recording: RecordingSettings = SHORT, *, per_drive: bool = False) -> Episode:
+        return record_episode(TINY.model_copy(update={"per_drive": per_drive}), AT_ONCE, recording, seed)
+
+    def town_of(episode: Episode) -> list[list[list[float]]]:
+        return [lane.centre.tolist() for lane in episode.lanes]
+
+    encoder, policy = drive(1), drive(1 + POLICY_SEED)
+    assert town_of(encoder) == town_of(policy)
+    assert not np.array_equal(encoder.x, policy.x)
+    assert not np.array_equal(encoder.light_state, policy.light_state)
+    assert town_of(encoder) != town_of(drive(1, SHORT.model_copy(update={"seed": 5})))
+    assert town_of(drive(1, per_drive=True)) != town_of(drive(2, per_drive=True))
 
 
 # --- many drives ----------------------------------------------------------------------------------------------------
@@ -159,8 +181,8 @@ def bytes_of(folder: Path) -> dict[str, bytes]:
 
 
 def test_the_order_of_the_seeds_changes_no_drive(tmp_path: Path) -> None:
-    one = run_flow(record_flow(TINY, SHORT, [3, 1, 2], tmp_path / "one"))
-    two = run_flow(record_flow(TINY, SHORT, [2, 3, 1], tmp_path / "two"))
+    one = run_flow(record_flow(TINY, AT_ONCE, SHORT, [3, 1, 2], tmp_path / "one"))
+    two = run_flow(record_flow(TINY, AT_ONCE, SHORT, [2, 3, 1], tmp_path / "two"))
     assert [path.name for path in one] == ["00000003", "00000001", "00000002"]
     assert [path.name for path in two] == ["00000002", "00000003", "00000001"]
     assert bytes_of(tmp_path / "one") == bytes_of(tmp_path / "two")
@@ -168,7 +190,7 @@ def test_the_order_of_the_seeds_changes_no_drive(tmp_path: Path) -> None:
 
 def test_only_missing_drives_are_recorded_and_drafts_of_the_dead_are_swept(tmp_path: Path) -> None:
     folder = tmp_path / "drives"
-    first = run_flow(record_flow(TINY, SHORT, [1, 2], folder))
+    first = run_flow(record_flow(TINY, AT_ONCE, SHORT, [1, 2], folder))
     stamp = (first[0] / "episode.json").stat().st_mtime_ns
     content = bytes_of(first[0])
     draft = folder / ".00000009.abc"
@@ -179,7 +201,7 @@ def test_only_missing_drives_are_recorded_and_drafts_of_the_dead_are_swept(tmp_p
         steps.append((stage, done, total))
         (folder / ".00000003.def").mkdir(exist_ok=True)  # as a worker that is killed in this moment
 
-    paths = run_flow(record_flow(TINY, SHORT, [1, 2, 3], folder), progress=progress)
+    paths = run_flow(record_flow(TINY, AT_ONCE, SHORT, [1, 2, 3], folder), progress=progress)
     assert steps == [("record", 2, 3), ("record", 3, 3)]
     assert (first[0] / "episode.json").stat().st_mtime_ns == stamp
     assert bytes_of(first[0]) == content

@@ -26,16 +26,19 @@ def content_key(stage: str, settings: object, inputs: tuple[str, ...], format_ve
 
 
 # Raised on purpose when a stage's code changes what it makes; a test holds each product's digest.
-FORMAT_VERSIONS = {"episodes": 2, "frames": 2, "encoder": 3, "state": 1, "cell": 2}
+FORMAT_VERSIONS = {"episodes": 3, "frames": 2, "encoder": 3, "state": 1, "cell": 2}
 
 
 def recording_key(settings: StudySettings) -> str:
     """Key of the drives: each is then known by its seed. How many there are does not matter here."""
     parts = {
         "town": settings.town.model_dump(mode="json"),
+        "dynamics": settings.dynamics.model_dump(mode="json"),
         "warm_up": settings.recording.warm_up,
         "duration": settings.recording.duration,
     }
+    if not settings.town.per_drive:
+        parts["town_seed"] = settings.recording.seed
     return content_key("episodes", parts, (), FORMAT_VERSIONS["episodes"])
 
 

@@ -57,6 +57,10 @@ class TownSettings(Settings):
     brake_hold: NotNegative = Field(
         0.5, description="a brake, once on, is held at least this long [s]; 0 is literal CARLA"
     )
+    per_drive: bool = Field(
+        default=False,
+        description="a new town for every drive; else one for all, drawn from recording.seed (literal)",
+    )
 
     @model_validator(mode="after")
     def _block_in_order(self) -> Self:
@@ -65,14 +69,28 @@ class TownSettings(Settings):
         return self
 
 
+class DynamicsSettings(Settings):
+    """How vehicles answer commands (ours, in the place of CARLA's engine, gear, tyres and steering)."""
+
+    lag: NotNegative = Field(
+        0.0, description="time constant with which the acceleration follows its command [s]; 0: at once"
+    )
+    wheel_lag: NotNegative = Field(
+        0.0, description="time constant with which the wheel angle follows its command [s]; 0: at once"
+    )
+    steering_unit: Positive = Field(
+        1.22, description="wheel angle of a steering label of 1 [rad] (CARLA: its largest, 70 degrees)"
+    )
+
+
 class RecordingSettings(Settings):
-    """How long a drive is watched, and which drives. Each drive has its own town, drawn from its own seed."""
+    """How long a drive is watched, and which drives. Traffic and lights of each drive are drawn from its own seed."""
 
     warm_up: NotNegative = Field(10.0, description="driven before recording starts [s]")
     duration: Positive = Field(24.0, description="recorded [s], at 10 Hz")
     encoder_episodes: Annotated[int, Field(ge=2)] = Field(80, description="drives for the encoder set")
     policy_episodes: Annotated[int, Field(ge=2)] = Field(80, description="other drives, for the policy set (Sec. IV-A)")
-    seed: Annotated[int, Field(ge=0)] = Field(0, description="seed of the first drive")
+    seed: Annotated[int, Field(ge=0)] = Field(0, description="seed of the first drive, and of the one town")
 
 
 class BirdviewSettings(Settings):
@@ -159,6 +177,7 @@ class StudySettings(Settings):
     """Every setting of every stage; a profile is one of these."""
 
     town: TownSettings = TownSettings()
+    dynamics: DynamicsSettings = DynamicsSettings()
     recording: RecordingSettings = RecordingSettings()
     birdview: BirdviewSettings = BirdviewSettings()
     frames: FramesSettings = FramesSettings()

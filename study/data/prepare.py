@@ -89,7 +89,7 @@ def drives_flow(settings: StudySettings, root: Path = HERE.data) -> Flow[list[Pa
             "installed here: run 'python -m study.data record' elsewhere with the same settings, and copy the folder"
         ) from error
     _check_room(root, recording_cost(settings).bytes, [folder])
-    return (yield from record_flow(settings.town, recording, seeds, folder))
+    return (yield from record_flow(settings.town, settings.dynamics, recording, seeds, folder))
 
 
 def describe_data(

@@ -24,11 +24,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from study.config.settings import DynamicsSettings
 from study.episode.schema import RATE_HZ, Episode
 from study.errors import BadInputError
 
 SLOWEST_RATE = 2.0  # below it, straight lines between positions are too far from a drive [Hz]
-STEERING_UNIT = 2.4  # wheel angle [rad] of a steering label of one, as in our town
+STEERING_UNIT = DynamicsSettings().steering_unit  # wheel angle [rad] of a steering label of one, as in our town
 MOST_STEERING = np.pi / 3  # [rad]
 CREEP = 1.0  # [m/s]
 BRAKING, STRONG = -0.5, 1.2  # [m/s2]: the town's throttle gives at most 1.0 at one half, 1.4 and more at one

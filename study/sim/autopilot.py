@@ -13,15 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from study.config.paper import ACCELERATIONS
+from study.config.settings import DynamicsSettings
 from study.episode.schema import GREEN, RED, YELLOW
+from study.sim.dynamics import BRAKE, DT, stopping_distance
 from study.sim.geometry import LENGTH, WIDTH, Floats, Ints, Pose
 from study.sim.town import Town
 
-DT = 0.1  # [s]
-STEERING_UNIT = 2.4  # wheel angle [rad] of a steering label of one
-THROTTLE = {0.5: 1.0, 1.0: 2.5}  # acceleration at rest, which falls with speed [m/s2]
-TOP_SPEED = 25.0  # at which throttle no longer accelerates [m/s]
-BRAKE = 5.0  # [m/s2]
 LOOK = 30.0  # look-ahead for vehicles on the route [m]
 REACH = LOOK + 8.0  # distance between centres within which lie all vehicles of the look-ahead [m]
 MARGIN = 0.1  # added on both sides of a vehicle when its path is tested [m]
@@ -43,7 +40,7 @@ GAP_MARGIN = 0.8  # by which a turning vehicle leaves the crossing lane before t
 class Decisions:
     """The command of every vehicle in one step, and what it was based on; [N] arrays.
 
-    `steering`: label, wheel angle over STEERING_UNIT, positive to the left. `acceleration`: one of ACCELERATIONS.
+    `steering`: label, wheel angle over `steering_unit`, positive to the left. `acceleration`: one of ACCELERATIONS.
     `light`: next signal on the route, -1 for none. `light_distance`: centre to its stop line along the route [m].
     `lead_gap`: free way from the front bumper along the route [m], inf where nothing is within LOOK.
     """
@@ -59,8 +56,10 @@ class Decisions:
 class Fleet:
     """The state of the autopilot: where every vehicle is on its planned route, and its decisions in force."""
 
-    def __init__(self, town: Town, vehicles: int, brake_hold: float, rng: np.random.Generator) -> None:
-        self.town, self.rng = town, rng
+    def __init__(
+        self, town: Town, vehicles: int, brake_hold: float, dynamics: DynamicsSettings, rng: np.random.Generator
+    ) -> None:
+        self.town, self.rng, self.dynamics = town, rng, dynamics
         self.hold_steps = round(brake_hold / DT)
         self.limits = np.array([strip.limit for strip in town.strips])
         self.starts: list[list[float]] = [[] for _ in range(vehicles)]  # of the route's strips, along it
@@ -210,22 +209,25 @@ class Fleet:
         self,
         step: int,
         pose: Pose,
+        controls: tuple[Floats, Floats],
         pairs: tuple[Ints, Ints],
         lights: NDArray[np.uint8],
     ) -> Decisions:
         """Return every vehicle's command from `pose` (x, y, heading, speed) after `follow`.
 
+        `controls`: acceleration [m/s2] and wheel angle [rad] that act now, the answers to earlier commands.
         `pairs`: each (i, j), sorted, of vehicles within at least REACH of each other; `lights`: states of the signals.
         """
         _, _, heading, speed = pose
+        force, wheel = controls
         lead_gap, lead = self._lead(pose, pairs)
         front = self.s + LENGTH / 2 - self.move_start  # of the bumper, from the stop line; -inf without a light
-        state = self._heed_lights(front, speed, lights)
+        state = self._heed_lights(front, speed, force, lights)
         crossing = self._right_of_way(step, front, speed, state, lead_gap, lead)
         gap = np.minimum(np.minimum(lead_gap, crossing), self._room_behind(step, front, speed, state))
         kmh = speed * 3.6
         limit = self.limits[self.strip] * 3.6
-        ray = np.maximum(0.5, kmh * kmh / 100) + 2
+        ray = np.maximum(0.5, kmh * kmh / 100) + 2 + speed * self.dynamics.lag
         brake = (kmh >= limit) | self.stopping | (gap < ray)
         self.brake_until[brake & ~self.braking] = step + self.hold_steps  # from the brake's first step on
         brake |= step < self.brake_until
@@ -234,7 +236,7 @@ class Fleet:
         acceleration = np.where(brake, low, np.where(kmh >= limit - 10, middle, high))
         known = (self.move >= 0) & (self.s <= self.move_start)
         return Decisions(
-            steering=-self._steer(heading, speed) / STEERING_UNIT,
+            steering=-self._steer(heading, speed, wheel) / self.dynamics.steering_unit,
             acceleration=acceleration,
             light=np.where(known, self.move_signal[self.move], -1)
             if len(self.move_signal)
@@ -244,17 +246,28 @@ class Fleet:
             lead_gap=lead_gap,
         )
 
-    def _steer(self, heading: Floats, speed: Floats) -> Floats:
-        """Return wheel angles by highway-env's cascade of lateral and heading control, with curvature fed forward."""
+    def _steer(self, heading: Floats, speed: Floats, wheel: Floats) -> Floats:
+        """Return wheel angles by highway-env's cascade of lateral and heading control, with curvature fed forward.
+
+        A wheel that lags is steered for the moment at which it has answered: by the pose and the path then.
+        """
+        lag = self.dynamics.wheel_lag
         v = np.maximum(speed, SLOWEST)
-        curvature = self.ahead(self.curvature, speed * DT)
-        course = self.ahead(self.heading, speed * DT) - np.arcsin(curvature * LENGTH / 2)  # the body points inwards
-        aside = np.arcsin((-KP_LATERAL * self.lateral / v).clip(-1, 1)).clip(-np.pi / 4, np.pi / 4)
+        curvature = self.ahead(self.curvature, speed * (DT + lag))
+        course = self.ahead(self.heading, speed * (DT + lag))
+        course = course - np.arcsin(curvature * LENGTH / 2)  # the body points inwards
+        lateral = self.lateral
+        if lag:
+            now = np.arctan(np.tan(wheel) / 2)
+            aslant = heading + now - self.ahead(self.heading, np.zeros(len(speed)))
+            lateral = lateral + lag * speed * np.sin(aslant)
+            heading = heading + lag * speed * np.sin(now) / (LENGTH / 2)
+        aside = np.arcsin((-KP_LATERAL * lateral / v).clip(-1, 1)).clip(-np.pi / 4, np.pi / 4)
         error = np.mod(course + aside - heading + np.pi, 2 * np.pi) - np.pi
         rate = v * curvature + KP_HEADING * error
         slip = np.arcsin((LENGTH / 2 / v * rate).clip(-1, 1))
-        wheel: Floats = np.arctan(2 * np.tan(slip)).clip(-MOST_STEERING, MOST_STEERING)
-        return wheel
+        command: Floats = np.arctan(2 * np.tan(slip)).clip(-MOST_STEERING, MOST_STEERING)
+        return command
 
     def _lead(self, pose: Pose, pairs: tuple[Ints, Ints]) -> tuple[Floats, Ints]:
         """Return the free way before each bumper [m], inf beyond LOOK, and the vehicle that ends it, -1 for none."""
@@ -290,14 +303,14 @@ class Fleet:
         gap[gap > LOOK] = np.inf
         return gap, lead
 
-    def _heed_lights(self, front: Floats, speed: Floats, lights: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def _heed_lights(self, front: Floats, speed: Floats, force: Floats, lights: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Decide whether to stop for the light ahead, and return the state that each vehicle faces."""
         state = np.full(len(front), GREEN, np.uint8)
         ruled = self.move >= 0
         state[ruled] = lights[self.move_signal[self.move[ruled]]]
         before = ruled & (front <= 0)
         bound = before & (state != GREEN)
-        way = speed * speed / (2 * BRAKE)
+        way = stopping_distance(speed, force, self.dynamics.lag)
         late = bound & (-front < way + DT * speed)  # too late to stop
         heeded = bound & (-front <= way + 0.2 * speed + 2.5)
         self.running = late & ~self.stopping & ((state == YELLOW) | self.running)
@@ -328,7 +341,7 @@ class Fleet:
         yields = across & self.move_left[a] & ~self.move_left[b]
         # From across: a left turn waits for vehicles that can arrive before it is through.
         stuck = (lead[j] >= 0) & (lead_gap[j] < into_j - front[j]) & (speed[lead[j]] < 2)
-        soon = _time(into_j - front[j], speed[j], 2.5, 12.0) < GAP_MARGIN + _time(
+        soon = _time(into_j - front[j], speed[j], 2.5, 12.0) < GAP_MARGIN + self.dynamics.lag + _time(
             out_i + LENGTH - front[i], speed[i], 1.7, 9.0
         )
         crossing = self.first_crossing[a]

@@ -12,22 +12,12 @@ from highway_env.envs.common.action import ActionType
 from highway_env.envs.common.observation import ObservationType
 
 from study.config.paper import ACCELERATIONS
-from study.config.settings import TownSettings
+from study.config.settings import DynamicsSettings, Model, TownSettings
 from study.episode.schema import GREEN
 from study.errors import BadInputError
 from study.randomness import rng
-from study.sim.autopilot import (
-    BRAKE,
-    DT,
-    LOOK,
-    MOST_STEERING,
-    REACH,
-    STEERING_UNIT,
-    THROTTLE,
-    TOP_SPEED,
-    Decisions,
-    Fleet,
-)
+from study.sim.autopilot import LOOK, MOST_STEERING, REACH, Decisions, Fleet
+from study.sim.dynamics import BRAKE, DT, THROTTLE, TOP_SPEED, check_dynamics, follow_command
 from study.sim.geometry import LENGTH
 from study.sim.lights import LightPlan, plan_lights
 from study.sim.road import TownNetwork, TownRoad, TownVehicle
@@ -46,11 +36,20 @@ class Traffic(TownRoad):
     """The town's road with lights and autopilot: decides for all vehicles, then moves them with highway-env."""
 
     def __init__(
-        self, town: Town, settings: TownSettings, rng: np.random.Generator, *, fast: bool, lights: LightPlan
+        self,
+        town: Town,
+        settings: TownSettings,
+        dynamics: DynamicsSettings,
+        rng: np.random.Generator,
+        *,
+        fast: bool,
+        lights: LightPlan,
     ) -> None:
         super().__init__(network=TownNetwork(town, fast=fast), np_random=rng)
         self.town, self.lights = town, lights
-        self.fleet = Fleet(town, settings.vehicles, settings.brake_hold, rng)
+        self.dynamics = dynamics
+        self.fleet = Fleet(town, settings.vehicles, settings.brake_hold, dynamics, rng)
+        self.force, self.wheel = np.zeros((2, settings.vehicles))  # as they act [m/s2, rad]
         self.steps = 0
         self.agents: list[int] = []  # of each vehicle; a vehicle that replaces another has a new number
         self.commands: dict[int, tuple[float, float]] = {}  # vehicle -> (acceleration, steering) for this step
@@ -85,6 +84,7 @@ class Traffic(TownRoad):
         strip, (x, y) = int(strips[best]), spots[best].tolist()
         vehicle = TownVehicle(self, [x, y], self.town.strips[strip].piece.heading, START_SPEED)
         self.fleet.place(slot, strip, float(s[best]))
+        self.force[slot] = self.wheel[slot] = 0.0
         if slot < len(self.vehicles):
             self.vehicles[slot] = vehicle
             self.agents[slot] = max(self.agents) + 1
@@ -100,19 +100,22 @@ class Traffic(TownRoad):
         """Decide the command of every vehicle; one in `commands` takes it from there."""
         pose = self.pose()
         self.light_states = self.lights.states(self.time)
-        decisions = self.fleet.decide(self.steps, pose, self.pairs_within(REACH, pose), self.light_states)
+        decisions = self.fleet.decide(
+            self.steps, pose, (self.force, self.wheel), self.pairs_within(REACH, pose), self.light_states
+        )
         for slot, (acceleration, steering) in self.commands.items():
             decisions.acceleration[slot], decisions.steering[slot] = acceleration, steering
         self.decisions = decisions
         speed = pose[3]
         push = np.where(decisions.acceleration == ACCELERATIONS[1], THROTTLE[0.5], THROTTLE[1.0])
-        force = np.where(
-            decisions.acceleration == ACCELERATIONS[0],
-            np.maximum(-BRAKE, -speed / DT),  # never backwards
-            push * (1 - speed / TOP_SPEED),
-        )
-        wheel = -decisions.steering * STEERING_UNIT
-        for vehicle, acceleration, steering in zip(self.vehicles, force.tolist(), wheel.tolist(), strict=True):
+        force = np.where(decisions.acceleration == ACCELERATIONS[0], -BRAKE, push * (1 - speed / TOP_SPEED))
+        force = follow_command(self.force, force, self.dynamics.lag)
+        self.force = np.maximum(force, -speed / DT)  # never backwards
+        wheel = -decisions.steering * self.dynamics.steering_unit
+        self.wheel = follow_command(self.wheel, wheel, self.dynamics.wheel_lag)
+        for vehicle, acceleration, steering in zip(
+            self.vehicles, self.force.tolist(), self.wheel.tolist(), strict=True
+        ):
             vehicle.act({"acceleration": acceleration, "steering": steering})
 
     def step(self, dt: float) -> None:
@@ -132,7 +135,7 @@ class TownAction(ActionType):
 
     def space(self) -> spaces.Space[Any]:
         """Return the space: class of acceleration, and steering (positive to the left; 0.25 is the paper's crop)."""
-        most = MOST_STEERING / STEERING_UNIT
+        most = MOST_STEERING / settings_of(self.env.config, "dynamics", DynamicsSettings).steering_unit
         return spaces.Tuple((spaces.Discrete(len(ACCELERATIONS)), spaces.Box(-most, most, (1,), np.float32)))
 
     @property
@@ -180,9 +183,9 @@ class TownEnv(AbstractEnv):
     """A town with its traffic at 10 Hz; the ego is one of the vehicles, the autopilot drives the others.
 
     An action is (class of acceleration, steering); `None` leaves the ego to the autopilot. The episode ends when the
-    ego collides or leaves its planned path. Config: `town` (TownSettings or a dict), `seed` (of a `reset` without one;
-    None draws one), `duration` [s], `fast_lookups` (False: highway-env's own searches). Raises BadInputError for
-    settings that cannot be met.
+    ego collides or leaves its planned path. Config: `town` and `dynamics` (settings or a dict), `seed` (of a `reset`
+    without one; None draws one), `town_seed` (of the one town; unused with `per_drive`), `duration` [s],
+    `fast_lookups` (False: highway-env's own searches). Raises BadInputError for settings that cannot be met.
     """
 
     @classmethod
@@ -191,7 +194,9 @@ class TownEnv(AbstractEnv):
         config: dict[str, Any] = super().default_config()
         return config | {
             "town": TownSettings(),
+            "dynamics": DynamicsSettings(),
             "seed": None,
+            "town_seed": 0,
             "duration": 60.0,
             "fast_lookups": True,
             "simulation_frequency": round(1 / DT),
@@ -209,17 +214,18 @@ class TownEnv(AbstractEnv):
         self.observation_space = self.observation_type.space()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Draw a town and its traffic from `seed`; the same seed gives the same drive."""
+        """Draw the drive from `seed`; the same seed gives the same drive."""
         self.drive_seed = self.config["seed"] if seed is None else seed
         observation, info = super().reset(seed=seed, options=options)
         return observation, info
 
     def _reset(self) -> None:
-        settings = self.config["town"]
-        if isinstance(settings, dict):
-            settings = TownSettings.model_validate(settings)
+        town = settings_of(self.config, "town", TownSettings)
+        dynamics = settings_of(self.config, "dynamics", DynamicsSettings)
         seed = int(self.np_random.integers(2**31)) if self.drive_seed is None else self.drive_seed
-        self.road = make_traffic(settings, seed, fast=self.config["fast_lookups"])
+        self.road = make_traffic(
+            town, seed, dynamics, town_seed=self.config["town_seed"], fast=self.config["fast_lookups"]
+        )
         self.controlled_vehicles = [self.road.vehicles[EGO]]
 
     def _simulate(self, action: Any = None) -> None:
@@ -242,17 +248,30 @@ class TownEnv(AbstractEnv):
         return bool(self.time >= self.config["duration"])
 
 
-def make_traffic(settings: TownSettings, seed: int, *, fast: bool = True) -> Traffic:
-    """Return a town with lights and vehicles, all drawn from the seed.
+def settings_of(config: dict[str, Any], name: str, kind: type[Model]) -> Model:
+    """Return a group of settings from an environment's config, where it may be a dict."""
+    return kind.model_validate(config[name])
+
+
+def make_traffic(
+    settings: TownSettings,
+    seed: int,
+    dynamics: DynamicsSettings = DynamicsSettings(),  # noqa: B008 - frozen
+    *,
+    town_seed: int = 0,
+    fast: bool = True,
+) -> Traffic:
+    """Return a town with lights and vehicles drawn from `seed`; the town is, unless `per_drive`, from `town_seed`.
 
     Raises BadInputError when the settings cannot be met.
     """
-    map_rng, light_rng, traffic_rng = (rng(seed, purpose) for purpose in ("town", "lights", "traffic"))
-    town = draw_town(settings, map_rng)
+    check_dynamics(settings, dynamics, LOOK)
+    light_rng, traffic_rng = (rng(seed, purpose) for purpose in ("lights", "traffic"))
+    town = draw_town(settings, rng(seed if settings.per_drive else town_seed, "town"))
     room = sum(town.strips[entry].piece.length for entry in town.ways)
     if settings.vehicles * 2 * APART > room:
         raise BadInputError(
             f"town: {settings.vehicles} vehicles do not fit on {room:.0f} m of lanes with {2 * APART:g} m for each; "
             f"take at most {int(room / APART / 2)} (vehicles) or a larger grid"
         )
-    return Traffic(town, settings, traffic_rng, fast=fast, lights=plan_lights(town, settings, light_rng))
+    return Traffic(town, settings, dynamics, traffic_rng, fast=fast, lights=plan_lights(town, settings, light_rng))

@@ -12,11 +12,11 @@ import numpy as np
 from filelock import FileLock
 
 from study.config.keys import FORMAT_VERSIONS, drive_name
-from study.config.settings import RecordingSettings, TownSettings
+from study.config.settings import DynamicsSettings, RecordingSettings, TownSettings
 from study.episode.files import write_episode
 from study.episode.schema import Agent, Episode, Lane, Light, empty_states
 from study.errors import BadInputError
-from study.sim.autopilot import DT, STEERING_UNIT
+from study.sim.dynamics import DT
 from study.sim.env import TownEnv, Traffic
 from study.sim.geometry import LANE_WIDTH, LENGTH, WIDTH, Floats
 from study.sim.town import Town
@@ -27,15 +27,17 @@ BEYOND = 60.0  # length of the planned route that is recorded beyond the last po
 STANDING = 0.1  # [m/s]
 
 
-def record_episode(town: TownSettings, recording: RecordingSettings, seed: int) -> Episode:
-    """Drive the town of that seed by autopilot and record it at 10 Hz; equal arguments give equal bits.
+def record_episode(town: TownSettings, dynamics: DynamicsSettings, recording: RecordingSettings, seed: int) -> Episode:
+    """Drive by autopilot and record it at 10 Hz; equal arguments give equal bits.
+
+    Traffic and lights are drawn from `seed`, and so is the town if it is `per_drive`; else from `recording.seed`.
 
     Raises BadInputError when the settings cannot be met.
     """
     steps = round(recording.duration / DT)
     if steps < 1:
         raise BadInputError(f"recording: a duration of {recording.duration:g} s is shorter than one step of {DT:g} s")
-    env = TownEnv({"town": town, "seed": seed, "duration": math.inf})
+    env = TownEnv({"town": town, "dynamics": dynamics, "seed": seed, "town_seed": recording.seed, "duration": math.inf})
     recorder = Recorder(env.road)
     for _ in range(round(recording.warm_up / DT)):
         env.step(None)
@@ -49,9 +51,11 @@ def record_episode(town: TownSettings, recording: RecordingSettings, seed: int) 
         "writer": "study.sim",
         "format_version": FORMAT_VERSION,
         "town": town.model_dump(mode="json"),
+        "dynamics": dynamics.model_dump(mode="json"),
         "recording": {"warm_up": recording.warm_up, "duration": recording.duration},
         "seed": seed,
-        "steering_unit": STEERING_UNIT,
+        "town_seed": seed if town.per_drive else recording.seed,
+        "steering_unit": dynamics.steering_unit,
         "traffic": recorder.facts(cycle),
     }
     return recorder.episode(drive_name(seed), source)
@@ -167,7 +171,11 @@ def _lane(town: Town, number: int) -> Lane:
 
 
 def record_flow(
-    town: TownSettings, recording: RecordingSettings, seeds: Sequence[int], folder: Path
+    town: TownSettings,
+    dynamics: DynamicsSettings,
+    recording: RecordingSettings,
+    seeds: Sequence[int],
+    folder: Path,
 ) -> Flow[list[Path]]:
     """Record the drives of `seeds` that `folder` lacks, as `folder/<seed:08d>`; return all paths in order of `seeds`.
 
@@ -179,7 +187,7 @@ def record_flow(
     with FileLock(folder / ".lock"):
         _remove_drafts(folder)  # of runs that were killed
         missing = [(seed, path) for seed, path in zip(seeds, paths, strict=True) if not path.exists()]
-        tasks = [Task(RECORD, record_drive, (town, recording, seed, path)) for seed, path in missing]
+        tasks = [Task(RECORD, record_drive, (town, dynamics, recording, seed, path)) for seed, path in missing]
         yield Batch(tasks, before=len(paths) - len(tasks))
         _remove_drafts(folder)  # of workers of this run that were killed
     return paths
@@ -190,6 +198,8 @@ def _remove_drafts(folder: Path) -> None:
         shutil.rmtree(draft)
 
 
-def record_drive(town: TownSettings, recording: RecordingSettings, seed: int, path: Path) -> None:
+def record_drive(
+    town: TownSettings, dynamics: DynamicsSettings, recording: RecordingSettings, seed: int, path: Path
+) -> None:
     """Record one drive and write it to `path`."""
-    write_episode(record_episode(town, recording, seed), path)
+    write_episode(record_episode(town, dynamics, recording, seed), path)
