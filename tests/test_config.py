@@ -113,6 +113,14 @@ def test_the_weight_of_an_absent_head_changes_nothing():
     assert encoder_key(one, Cell(heads="full"), "f") != encoder_key(other, Cell(heads="full"), "f")
 
 
+def test_a_sweep_file_may_give_one_profile_settings_of_its_own():
+    assert load_grid("datasize", profile="laptop").settings == {"encoder": {"batch": 32}}
+    assert load_grid("datasize", profile="paper").settings == {}
+    assert load_grid("datasize-budget-steps", profile="laptop").settings == {
+        "encoder": {"batch": 32, "budget": "steps"}
+    }
+
+
 def test_sums_and_means_of_a_heads_loss_are_two_encoders():
     one, other = StudySettings(), changed(encoder={"loss": "mean"})
     assert one.encoder.loss == "sum"
@@ -185,8 +193,8 @@ def test_a_wrong_rule_is_explained(tmp_path, allowance):
 def test_unknown_names_list_the_known_ones():
     with pytest.raises(BadInputError, match="choose from datasize, datasize-budget-steps"):
         load_grid("head")
-    with pytest.raises(BadInputError, match="choose from laptop, paper, smoke"):
-        load_profile("desktop")
+    with pytest.raises(BadInputError, match="choose from desktop, laptop, paper, smoke"):
+        load_profile("tablet")
 
 
 def test_a_head_set_with_an_unknown_head_is_one_clear_error(monkeypatch):

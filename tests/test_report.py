@@ -10,10 +10,12 @@ import pandas as pd
 import pytest
 from pypdf import PdfReader
 
+from study.config.files import load_profile
 from study.config.grid import Grid
 from study.errors import BadInputError
 from study.report import __main__, build
 from study.report.build import build_report
+from study.report.scale import training_scale
 from study.report.summary import summarise
 from tests.support.synthetic_records import DATASIZE_GRID, HEADS_GRID, World, simulate
 
@@ -98,6 +100,26 @@ def test_numbers_in_the_pdf_are_those_of_the_json(built):
     assert f"{100 * content['floor']['acceleration_accuracy']:.1f} %" in text
     for claim in content["claims"]:
         assert claim["outcome"] in text
+
+
+def test_the_first_page_says_how_far_the_scale_is_from_the_papers(built, tmp_path):
+    """Frames, images shown and steps, as shares of 400,000, 80 million and 39,200 at all the data."""
+    settings = load_profile("laptop")
+    pdf = build_report(simulate(DATASIZE_GRID, World(epochs=8), settings=settings), tmp_path)
+    (first, *_), scale = pages(pdf), json.loads((tmp_path / "datasize" / "report.json").read_text())["scale"]
+    assert [row["fraction"] for row in scale] == [1.0, 0.5, 0.25, 0.125, 0.0625]
+    assert (scale[0]["frames"], scale[0]["images"], scale[0]["steps"]) == (20_000, 240_000, 157 * 12)
+    assert (scale[0]["paper_frames"], scale[0]["paper_images"], scale[0]["paper_steps"]) == (
+        400_000,
+        80_000_000,
+        39_200,
+    )
+    assert (scale[-1]["frames"], scale[-1]["steps"], scale[-1]["paper_steps"]) == (1250, 120, 2600)
+    for words in ("Scale at 100 % of the data", "5.0 % of the paper", "4.8 % of 39", "Scale at 6.25 % of the data"):
+        assert words in first
+    same = settings.model_copy(update={"encoder": settings.encoder.model_copy(update={"budget": "steps"})})
+    steps = {row.steps for row in training_scale(simulate(DATASIZE_GRID, World(epochs=8), settings=same))}
+    assert steps == {157 * 12}
 
 
 def test_a_complete_report_has_no_banner_and_names_its_simulator_and_design(built):

@@ -50,6 +50,34 @@ CONFOUNDS = (
         "of acceleration are as common as on the road: the floor is higher, and less is left to gain above it.",
     ),
     Confound(
+        "encoder.loss",
+        "heads-loss-mean",
+        fractions=False,
+        about="Summed over an image's numbers, as the paper writes it, rec weighs three times as much as a mask; as "
+        "means, each head weighs the same. A difference that is there with the means alone is one of weights.",
+    ),
+    Confound(
+        "encoder.epochs",
+        "heads-short",
+        fractions=False,
+        about="The same data in fewer steps. A difference that grows with the steps may grow further than this scale "
+        "shows.",
+    ),
+    Confound(
+        "policy.inputs",
+        "heads-given-speed",
+        fractions=False,
+        about="Policies that are given the true speeds of the past second need not read them off the latent. A "
+        "difference that goes away then was one in how well speed can be read.",
+    ),
+    Confound(
+        "policy.share",
+        "heads-policy-half",
+        fractions=False,
+        about="Policies learn from a part of their training frames. A difference that is larger there is one that more "
+        "frames for policies would make smaller.",
+    ),
+    Confound(
         "encoder.budget",
         "datasize-budget-steps",
         fractions=True,

@@ -70,11 +70,19 @@ def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
 def load_grid(
     name: str, overrides: dict[str, Any] | None = None, folder: Path = HERE.sweeps, profile: str = "laptop"
 ) -> Grid:
-    """Return the sweep of that name with a profile's rules. Raises BadInputError for an unknown name or setting."""
+    """Return the sweep of that name with a profile's rules and settings.
+
+    Raises BadInputError for an unknown name or setting.
+    """
     files = named_files(folder)
     if name not in files:
         raise one_of("sweep", name, files or [f"nothing: there are no sweep files in {folder.absolute()}"])
     content = merge(read_yaml(files[name]), overrides or {}) | {"name": name}
+    by_profile = content.pop("profile_settings", {})
+    if not isinstance(by_profile, dict):
+        raise BadInputError(f"sweep {name}: profile_settings maps profiles to settings: {{laptop: {{encoder: ..}}}}")
+    if profile in by_profile:
+        content["settings"] = merge(content.get("settings", {}), by_profile[profile])
     if isinstance(content.get("rules"), dict):
         content["rules"] = {rule: _of_profile(value, profile) for rule, value in content["rules"].items()}
     return validated(Grid, content, f"sweep {name}")

@@ -16,6 +16,10 @@ ACCELERATION_HIDDEN = (128, 64)
 ACCELERATIONS = (-1.0, 0.5, 1.0)  # class 0, 1, 2: throttle - brake of the autopilot (Sec. IV-C)
 STEERING_CROP = 0.25  # where a command is applied; the loss sees the raw label
 DROPOUT = 0.5
+ENCODER_FRAMES = 500_000  # train and test (Sec. IV-A)
+TRAIN_SHARE = 0.8  # of the frames (Sec. V)
+ENCODER_EPOCHS = 200  # (Sec. IV-B)
+ENCODER_BATCH = 2048  # (Sec. IV-B)
 
 
 def parameter_counts() -> dict[str, int]:

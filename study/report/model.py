@@ -57,6 +57,21 @@ class Sweep(Part):
     failed: tuple[Failure, ...]
 
 
+class Scale(Part):
+    """How much an encoder is trained at one data fraction: here, and as the paper says.
+
+    `frames`: of training, distinct ones; `images`: shown in all epochs; `steps` of the optimiser.
+    """
+
+    fraction: float
+    frames: int
+    images: int
+    steps: int
+    paper_frames: int
+    paper_images: int
+    paper_steps: int
+
+
 class Spread(Part):
     """A final score over seeds; `units` has the value of each sampling unit by its seed."""
 
@@ -199,6 +214,7 @@ class Report(Part):
 
     format_version: int = FORMAT_VERSION
     sweep: Sweep
+    scale: tuple[Scale, ...] = ()
     metrics: tuple[Metric, ...]
     floor: dict[str, Number]
     ceiling: Spread | None = None

@@ -31,6 +31,7 @@ from study.report.model import (
     Sweep,
     VariedSetting,
 )
+from study.report.scale import training_scale
 from study.results.cell_result import CellResult
 from study.results.sweep_record import SweepRecord
 from study.stages import RESULT_BYTES, data_cost
@@ -51,6 +52,7 @@ def summarise(record: SweepRecord) -> Report:
     contrasts = (effects.paired_contrasts(record, name, panel) for name, panel in panels.items())
     return Report(
         sweep=_sweep(record, "A" if learning_curves.design(accuracy.values()) == "A" else "B"),
+        scale=training_scale(record),
         metrics=tuple(METRICS.values()),
         floor=floor,
         ceiling=ceiling,
