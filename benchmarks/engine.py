@@ -246,7 +246,7 @@ def measure(folder: Path) -> Numbers:
     with chdir(folder):
         laptop = load_profile("laptop")
         epochs = {"encoder": {"epochs": laptop.encoder.epochs}, "policy": {"epochs": laptop.policy.epochs}}
-        small = make_plan("heads", "smoke", epochs, {"heads": ["rec"], "ceiling": False})
+        small = make_plan("heads", "smoke", epochs, {"heads": ["rec"], "baselines": ()})
         run = [sys.executable, "-c", IMPORT]
         imports = [
             float(subprocess.run(run, env=environment, check=True, capture_output=True, text=True).stdout)

@@ -17,8 +17,9 @@ from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias, TypeVar
 
+from study.config.baselines import CEILING, SUPERVISED
 from study.config.grid import Cell
-from study.config.heads import CEILING, HEAD_SETS, mask_heads
+from study.config.heads import HEAD_SETS, mask_heads
 from study.config.keys import cell_key, encoder_key, frames_key, recording_key
 from study.config.paper import IMAGE
 from study.config.settings import StudySettings
@@ -31,6 +32,7 @@ HEAD_IMAGE_S = 1 / 3700  # the same for each head
 TEST_COST = 0.35  # an image evaluated, as a share of an image trained
 ENCODED_PER_S = 6_000.0  # images encoded, on one core
 POLICY_FRAME_S = 1 / 500_000  # a frame forward and backward through one policy, on two cores
+SUPERVISED_EPOCHS = 20  # over the policy set, of the supervised baseline
 DRIVE_READ_S = 0.12  # a drive read again for the true state
 RESULT_S = 5.0  # a result is assembled, exported and committed
 
@@ -124,7 +126,7 @@ def _render_seconds(work: Work) -> float:
 
 
 def _encoder_seconds(work: Work) -> float:
-    if work.cell.heads == CEILING:
+    if work.cell.baseline:
         return 0.0
     frames, encoder = work.settings.frames, work.settings.encoder
     train = frames.encoder * (1 - frames.test_share)
@@ -137,6 +139,8 @@ def _encoder_seconds(work: Work) -> float:
 def _latents_seconds(work: Work) -> float:
     if work.cell.heads == CEILING:
         return work.settings.recording.policy_episodes * DRIVE_READ_S
+    if work.cell.heads == SUPERVISED:
+        return SUPERVISED_EPOCHS * work.settings.frames.policy * ENCODER_IMAGE_S
     return work.settings.frames.policy / ENCODED_PER_S
 
 
@@ -186,7 +190,7 @@ def data_cost(settings: StudySettings, *, recorded: bool = True) -> Cost:
 
 
 def cell_cost(settings: StudySettings, cell: Cell, policy_seeds: int) -> Cost:
-    """Return the cost of one cell: its encoder, unless it is the ceiling, and its policies."""
+    """Return the cost of one cell: its encoder, unless it is a baseline, and its policies."""
     work = Work(settings, cell, policy_seeds)
     return Cost(sum(stage.cost(work) for stage in CELL_STAGES), RESULT_BYTES)
 

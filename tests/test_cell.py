@@ -10,6 +10,7 @@ import torch
 from study.cell import flow, stages
 from study.cell.flow import cell_flow, product_folders
 from study.cell.job import CellJob
+from study.config.baselines import BASELINES, CEILING
 from study.config.files import load_profile
 from study.config.grid import Cell
 from study.config.keys import cell_key
@@ -19,7 +20,7 @@ from study.errors import BadInputError
 from study.results.cell_result import ARRAYS, CURVE_COLUMNS
 
 SETTINGS = load_profile("smoke", {"encoder": {"epochs": 2, "batch": 16}, "policy": {"epochs": 5, "batch": 16}})
-REC, CEILING = Cell(heads="rec"), Cell(heads="state")
+REC = Cell(heads="rec")
 SEEDS = 3
 
 
@@ -97,19 +98,20 @@ def test_only_what_is_missing_or_damaged_is_made_again_and_is_what_it_was(new_jo
     assert weights.read_bytes() == content
 
 
-def test_the_ceiling_has_neither_encoder_nor_network(new_job, small_drives):
-    """Its latents are the true state of the drives behind the policy set."""
-    result, network, stages = run(new_job(CEILING, drives=small_drives[3].parent))
+@pytest.mark.parametrize("name", BASELINES)
+def test_a_baseline_has_policies_but_neither_encoder_nor_network(name, new_job, small_drives):
+    result, network, stages = run(new_job(Cell(heads=name), drives=small_drives[3].parent))
     assert stages == ["latents", "policy", "result"]
     assert (network, result.encoder, result.samples) == (b"", {}, {})
     assert set(result.curves["stage"]) == {"policy"}
     assert result.facts["seconds"]["encoder"] == 0
     assert np.isfinite(result.curves["value"]).all()
+    assert result.predictions["z"].std() > 0
 
 
 def test_policies_that_are_given_speeds_have_no_network_that_images_could_drive(new_job, small_drives):
     settings = SETTINGS.model_copy(update={"policy": SETTINGS.policy.model_copy(update={"inputs": "z+speed"})})
-    for cell in (REC, CEILING):
+    for cell in (REC, Cell(heads=CEILING)):
         result, network, _ = run(new_job(cell, settings, drives=small_drives[3].parent))
         assert result.policies["steering_0_weight"].shape == (SEEDS, 74, 256)
         assert result.predictions["z"].shape[1] == 64

@@ -93,7 +93,7 @@ def test_three_machines_and_many_kills_end_with_the_table_of_one(undisturbed, cl
     kills = Counter()
 
     def begin():
-        return CommandProcess(folder, *sweep_command(*TINY_SWEEP, "--ceiling", "false", *cluster.words))
+        return CommandProcess(folder, *sweep_command(*TINY_SWEEP, "--baselines", "[]", *cluster.words))
 
     def kill(run, *roles):
         pids = [pid for role in roles for pid in run.pids(role)]

@@ -8,6 +8,7 @@ from study.errors import BadInputError
 from study.report.comparison import compare, difference
 from study.report.markdown import markdown
 from study.report.model import checked, read_report
+from study.report.rounding import percent
 from study.report.summary import summarise
 from tests.support.processes import ROOT
 from tests.support.synthetic_records import HEADS_GRID, World, simulate
@@ -71,9 +72,9 @@ def test_scores_stand_side_by_side_with_the_difference_and_its_interval(pair, te
 def test_the_share_of_the_possible_gain_stands_beside_with_floor_and_ceiling(pair, text):
     shares = [next(score for score in one.scores if score.heads == "full").share for one in pair]
     assert row(text, "accuracy [%]")[5:] == ["share of gain, first [%]", "share of gain, second [%]"]
-    assert row(text, "full")[5:] == [f"{100 * share:.0f}" for share in shares]
-    assert row(text, "*ceiling (true state)*")[1:3] == [f"{100 * one.ceiling.mean:.2f} (15)" for one in pair]
-    assert row(text, "*ceiling (true state)*")[5:] == ["100", "100"]
+    assert row(text, "full")[5:] == [percent(share, 0) for share in shares]
+    assert row(text, "true state")[1:3] == [f"{100 * one.ceiling.mean:.2f} (15)" for one in pair]
+    assert row(text, "true state")[5:] == ["100", "100"]
     assert row(text, "*floor (commonest class)*")[1:3] == [
         f"{100 * one.floor['acceleration_accuracy']:.2f}" for one in pair
     ]
@@ -82,13 +83,13 @@ def test_the_share_of_the_possible_gain_stands_beside_with_floor_and_ceiling(pai
     ]
 
 
-def test_a_report_without_a_ceiling_or_of_a_time_before_it_is_compared_without_shares(content):
-    old = {name: value for name, value in content.items() if name != "ceiling"}
+def test_a_report_without_baselines_is_compared_without_shares(content):
+    old = {name: value for name, value in content.items() if name != "baselines"}
     old["scores"] = [{name: value for name, value in score.items() if name != "share"} for score in old["scores"]]
     complete, before = checked(content, "new"), checked(old, "old")
     text = compared(complete, before, ("new", "old"))
     assert "share of gain" not in text
-    assert row(text, "*ceiling (true state)*")[1:] == [f"{100 * complete.ceiling.mean:.2f} (4)", *["\N{EM DASH}"] * 3]
+    assert "Only in the first: untrained encoder," in text
     assert "ceiling" not in compared(before, before, ("old", "old"))
 
 
@@ -146,12 +147,12 @@ def test_cells_at_different_fractions_are_distinguished(content):
     text = compared(checked(content, "all"), half, ("all", "half"))
     assert "Only in the first: rec at 100 %, full at 100 %." in text
     assert "Only in the second: rec at 50 %, full at 50 %." in text
-    assert row(text, "*ceiling (true state)*")[3] != "\N{EM DASH}"
+    assert row(text, "true state")[3] != "\N{EM DASH}"
     assert "### Convergence" not in text
 
 
 def test_two_sweeps_without_a_common_cell_are_reported(content):
-    grid = SMALL.model_copy(update={"heads": ("rec+plan",)})
+    grid = SMALL.model_copy(update={"heads": ("rec+plan",), "baselines": ()})
     text = compared(checked(content, "a"), checked(made(simulate(grid, FAST)), "b"), ("a", "b"))
     assert "No head set and fraction is finished in both" in text
     empty = simulate(SMALL, FAST, unfinished=[cell.label for cell in SMALL.cells()])

@@ -5,6 +5,7 @@ import itertools
 
 import pytest
 
+from study.config.baselines import BASELINES
 from study.config.files import load_grid, load_profile
 from study.config.grid import Cell
 from study.config.heads import HEAD_SETS
@@ -38,30 +39,37 @@ def test_heads_sweep_covers_all_head_sets():
     assert load_grid("heads").heads == tuple(HEAD_SETS)
 
 
-def test_datasize_shares_its_full_data_cells_and_the_ceiling_with_heads():
+def test_datasize_shares_its_full_data_cells_and_the_baselines_with_heads():
     settings = load_profile("laptop")
     keys = [
         {cell_key(settings, cell, grid.policy_seeds, frames_key(settings)) for cell in grid.cells()}
         for grid in (load_grid("heads"), load_grid("datasize"))
     ]
-    assert len(keys[0] & keys[1]) == 3
+    baselines = sum(baseline.seeds for baseline in BASELINES.values())
+    assert len(keys[0] & keys[1]) == 2 + baselines
 
 
 def test_encoder_seeds_multiply_the_cells():
-    one, three = (load_grid("heads", {"ceiling": False, "encoder_seeds": count}).cells() for count in (1, 3))
+    one, three = (load_grid("heads", {"baselines": (), "encoder_seeds": count}).cells() for count in (1, 3))
     assert len(three) == 3 * len(one)
 
 
-def test_the_ceiling_is_one_more_cell_and_leaves_the_others_as_they_are():
+def test_baselines_are_further_cells_and_leave_the_others_as_they_are():
     settings = load_profile("laptop")
-    with_, without = (
-        [cell_key(settings, cell, 15, "frames") for cell in load_grid("heads", {"ceiling": there}).cells()]
-        for there in (True, False)
+    with_, one, without = (
+        [cell_key(settings, cell, 15, "frames") for cell in load_grid("heads", {"baselines": names}).cells()]
+        for names in (tuple(BASELINES), ("state",), ())
     )
-    assert with_[:-1] == without
+    assert with_[:4] == one[:4] == without
+    assert with_[-1:] == one[4:]
 
 
-def test_the_ceiling_depends_on_frames_and_policies_but_on_no_encoder():
+def test_an_unknown_baseline_is_refused_with_those_there_are():
+    with pytest.raises(BadInputError, match=r"unknown baseline 'ceiling'; choose from untrained, .*or \[\] for none"):
+        load_grid("heads", {"baselines": ["ceiling"]})
+
+
+def test_the_true_state_depends_on_frames_and_policies_but_on_no_encoder():
     cell, one = load_grid("heads").cells()[-1], StudySettings()
     assert encoder_key(one, cell, "f") == encoder_key(changed(encoder={"epochs": 99}), cell, "f")
     assert encoder_key(one, cell, "f") != encoder_key(one, cell, "g")

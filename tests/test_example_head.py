@@ -37,7 +37,7 @@ def test_a_further_mask_leaves_the_papers_as_they_are() -> None:
 def test_a_sweep_with_the_example_ends_with_its_report(tmp_path: Path) -> None:
     working_folder(tmp_path)
     shutil.copy(ROOT / "examples/light.yaml", tmp_path / "sweeps")
-    words = ("light", "--profile", "tiny", "--policy_seeds", "2", "--ceiling", "false")
+    words = ("light", "--profile", "tiny", "--policy_seeds", "2", "--baselines", "[]")
     completed = sweep(tmp_path, *words, "--heads", "[rec,rec+light]", "--workers", "2")
     assert completed.returncode == 0, completed.stderr
     report = [sys.executable, "-m", "study.report", "light"]  # another process knows the head from the store

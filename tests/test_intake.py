@@ -25,8 +25,8 @@ PLAN = (
     "[rec,full]",
     "--policy_seeds",
     "2",
-    "--ceiling",
-    "false",
+    "--baselines",
+    "[]",
     "--no-report",
 )
 DEVICE = "a GPU far away"
@@ -34,7 +34,7 @@ DEVICE = "a GPU far away"
 
 @pytest.fixture(scope="module")
 def plan():
-    return make_plan("heads", "smoke", {}, {"heads": ["rec", "full"], "policy_seeds": 2, "ceiling": False})
+    return make_plan("heads", "smoke", {}, {"heads": ["rec", "full"], "policy_seeds": 2, "baselines": ()})
 
 
 @pytest.fixture(scope="module")

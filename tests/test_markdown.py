@@ -48,21 +48,22 @@ def cells(text, start):
     return [cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]]
 
 
-def test_the_ceiling_has_a_row_and_scores_their_share_of_the_way_to_it(report):
+def test_baselines_have_rows_and_scores_their_share_of_the_way_from_the_best_trivial_one_to_the_ceiling(report):
     text = part(written(report), "Final scores")
-    floor, top, at = report.floor["acceleration_accuracy"], report.ceiling, cells(text, "Cell").index("share")
-    assert cells(text, "*ceiling (true state)*")[1:3] == [str(top.n), f"{100 * top.mean:.2f}"]
-    assert cells(text, "*ceiling (true state)*")[at] == "100"
+    floor, top, at = report.trivial.accuracy.mean, report.ceiling, cells(text, "Cell").index("share")
+    assert cells(text, "*true state*")[1:3] == [str(top.n), f"{100 * top.mean:.2f}"]
+    assert cells(text, "*true state*")[at] == "100"
+    assert cells(text, f"*{report.trivial.cell}*")[at] == "0"
     for score in report.scores:
         gained = (score.accuracy.mean - floor) / (top.mean - floor)
-        assert cells(text, score.cell)[at] == f"{100 * gained:.0f}"
+        assert cells(text, score.cell)[at] == percent(gained, 0)
 
 
-def test_without_a_ceiling_it_is_not_mentioned():
-    text = written(summarise(simulate(HEADS_GRID.model_copy(update={"ceiling": False}), World(epochs=6))))
+def test_without_baselines_they_are_not_mentioned():
+    text = written(summarise(simulate(HEADS_GRID.model_copy(update={"baselines": ()}), World(epochs=6))))
     assert "| Cell | n | accuracy" in text
     assert "eiling" not in text
-    assert "possible gain" not in text
+    assert "aseline" not in part(text, "Final scores")
 
 
 def test_confounds_that_were_run_are_shown_under_both_values(report):

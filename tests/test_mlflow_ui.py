@@ -43,7 +43,7 @@ def server(empty_store, tmp_path_factory):
 @pytest.fixture(scope="module")
 def sweep(server, small_store, small_drives):
     """Log a finished sweep of the four head sets: drawn curves, a real report, the card of real frames, models."""
-    record = simulate(HEADS_GRID.model_copy(update={"policy_seeds": SEEDS, "ceiling": False}), World(epochs=EPOCHS))
+    record = simulate(HEADS_GRID.model_copy(update={"policy_seeds": SEEDS, "baselines": ()}), World(epochs=EPOCHS))
     tracker = Tracker(server.uri)
     run_id = tracker.open_sweep(
         record.grid, record.profile, record.settings, record.planned, record.data, record.provenance

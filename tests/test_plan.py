@@ -30,7 +30,7 @@ def test_a_device_of_the_cluster_need_not_be_on_this_machine():
 
 
 def test_a_plans_command_makes_the_same_plan():
-    words = ["heads", "--profile", "smoke", "--heads", "[rec,rec+plan]", "--ceiling", "false", "--encoder.epochs", "3"]
+    words = ["heads", "--profile", "smoke", "--heads", "[rec,rec+plan]", "--baselines", "[]", "--encoder.epochs", "3"]
     words += ["--encoder.head_weights", "{plan: 5}", "--town.block", "[60, 90]"]
     plan = plan_of(words)
     program, again = shlex.split(plan.command)[:3], shlex.split(plan.command)[3:]

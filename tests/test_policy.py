@@ -34,6 +34,7 @@ def drive(frames: int, seed: int, noise: float = 0.3) -> tuple[np.ndarray, pd.Da
     signal = rng.normal(size=(frames, 64))
     wish = signal[:, 0] + signal[:, 1] + noise * rng.normal(size=frames)
     labels = {"steering": np.tanh(signal[:, 2]) / 4, "acceleration": np.digitize(wish, [-0.6, 0.6])}
+    labels |= {"keyframe": rng.random(frames) < 0.3, "weight": rng.uniform(0.5, 1.5, frames)}
     scale = np.geomspace(0.1, 10, 64)
     return (signal * scale + 3 * scale).astype(np.float32), pd.DataFrame(labels)
 
@@ -335,17 +336,26 @@ def test_policies_learn_what_can_be_learnt() -> None:
 def test_metrics_agree_with_numpy() -> None:
     rng = np.random.default_rng(0)
     truth, right = rng.normal(size=90), rng.choice(3, 90, p=[0.1, 0.3, 0.6])
+    keyframe, weight = rng.random(90) < 0.3, rng.uniform(0, 2, 90)
     steering, logits = rng.normal(size=(4, 90)) * 2, rng.normal(size=(4, 90, 3))
     got = measure(
         torch.tensor(steering, dtype=torch.float32),
         torch.tensor(logits, dtype=torch.float32),
-        Labels(torch.tensor(truth, dtype=torch.float32), torch.tensor(right)),
+        Labels(
+            torch.tensor(truth, dtype=torch.float32),
+            torch.tensor(right),
+            *(torch.tensor(values, dtype=torch.float32) for values in (keyframe, weight)),
+        ),
     )
     off = np.abs(steering - truth)
     chance = np.exp(logits) / np.exp(logits).sum(2, keepdims=True)
     hit = logits.argmax(2) == right
+    errors = np.where(off < 1, off**2 / 2, off - 0.5)
     expected = {
-        "steering_loss": np.where(off < 1, off**2 / 2, off - 0.5).mean(1),
+        "steering_loss": errors.mean(1),
+        "keyframe_accuracy": hit[:, keyframe].mean(1),
+        "natural_accuracy": np.average(hit, axis=1, weights=weight),
+        "natural_steering_loss": np.average(errors, axis=1, weights=weight),
         "acceleration_accuracy": hit.mean(1),
         "balanced_accuracy": np.mean([hit[:, right == each].mean(1) for each in range(3)], axis=0),
         "cross_entropy": -np.log(chance[:, np.arange(90), right]).mean(1),
@@ -361,7 +371,7 @@ def test_of_equal_logits_the_first_class_counts() -> None:
 
 def test_balanced_accuracy_is_over_the_classes_that_occur() -> None:
     logits = functional.one_hot(torch.tensor([[0, 0, 0, 1]]), 3).float()
-    metrics = measure(torch.zeros(1, 4), logits, Labels(torch.zeros(4), torch.tensor([0, 0, 1, 1])))
+    metrics = measure(torch.zeros(1, 4), logits, Labels(torch.zeros(4), torch.tensor([0, 0, 1, 1]), *torch.ones(2, 4)))
     assert metrics[2].item() == pytest.approx(0.75)
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from study.config.paper import ACCELERATIONS
 from study.config.settings import BirdviewSettings, FramesSettings
 from study.data.selection import LABELS, STANDING, candidates, choose, histograms, rake
 from study.episode.files import read_episode
@@ -67,7 +68,8 @@ def test_standing_moments_are_thinned_for_the_encoder_set_only(drives):
 
 def test_drives_are_split_before_frames(pool):
     """Exact sizes, and no drive on both sides."""
-    rows, train, test_drives = choose(pool, "encoder", 200, 10, FramesSettings())
+    rows, decided, test_drives = choose(pool, "encoder", 200, 10, FramesSettings())
+    train = decided["train"]
     assert len(np.unique(rows)) == 200
     assert train.sum() == 160
     assert len(test_drives) == 2
@@ -76,7 +78,8 @@ def test_drives_are_split_before_frames(pool):
 
 
 def test_the_literal_split_mixes_frames_of_a_drive(pool):
-    rows, train, test_drives = choose(pool, "encoder", 200, 10, FramesSettings(split="frame"))
+    rows, decided, test_drives = choose(pool, "encoder", 200, 10, FramesSettings(split="frame"))
+    train = decided["train"]
     assert (len(rows), train.sum(), test_drives) == (200, 160, [])
     assert set(pool["episode"][rows[~train]]) <= set(pool["episode"][rows[train]])
 
@@ -91,7 +94,8 @@ def test_the_policy_set_has_the_shares_it_should_have(pool):
     """Each split by itself: the drives have enough of everything at this size."""
     before = histograms(pool, np.ones(len(pool["step"]), bool))
     assert abs(before["standing"] / before["frames"] - 0.08) > 0.1  # else the test could not fail
-    rows, train, _ = choose(pool, "policy", 250, 10, FramesSettings())
+    rows, decided, _ = choose(pool, "policy", 250, 10, FramesSettings())
+    train = decided["train"]
     for part, number in ((rows[train], 200), (rows[~train], 50)):
         after = histograms({key: values[part] for key, values in pool.items()}, np.ones(len(part), bool))
         assert after["frames"] == number
@@ -99,6 +103,34 @@ def test_the_policy_set_has_the_shares_it_should_have(pool):
         np.testing.assert_allclose(np.array(after["acceleration"]) / number, CLASSES, atol=0.04)
         assert after["standing"] / number == pytest.approx(0.08, abs=0.03)
         assert after["majority_accuracy"] == pytest.approx(1 / 3, abs=0.04)
+
+
+def test_weighted_policy_frames_are_distributed_as_the_moments_they_were_chosen_from(pool):
+    """Only where raking leaves some frame of every kind: weights cannot speak for kinds that are gone."""
+    rows, decided, test_drives = choose(pool, "policy", 250, 10, FramesSettings())
+    for part, inside in ((decided["train"], False), (~decided["train"], True)):
+        weight, here = decided["weight"][part], np.isin(pool["episode"], test_drives) == inside
+        assert weight.mean() == pytest.approx(1, abs=1e-5)
+        for name in ("standing", "acceleration"):
+            chosen = pool[name][rows[part]]
+            for value in np.unique(pool[name]):
+                share = (weight * (chosen == value)).sum() / weight.sum()
+                assert share == pytest.approx((pool[name][here] == value).mean(), abs=0.05)
+
+
+def test_a_keyframe_is_a_moment_whose_class_has_just_changed(drives):
+    path = drives[0]
+    table = candidates(path, 0, "policy", FramesSettings(spacing=0.1), VIEW)
+    episode = read_episode(path)
+    place = {agent.id: index for index, agent in enumerate(episode.agents)}
+    assert 0.05 < table["keyframe"].mean() < 0.95
+    for step, agent, keyframe, last, steering in zip(
+        *(table[name] for name in ("step", "agent", "keyframe", "last_acceleration", "last_steering")), strict=True
+    ):
+        commands = episode.acceleration[:, place[agent]]
+        assert keyframe == (commands[step - 5 : step] != commands[step]).any()
+        assert ACCELERATIONS[last] == commands[step - 1]
+        assert steering == episode.steering[step - 1, place[agent]]
 
 
 def test_balancing_on_steering_alone_leaves_the_rest(pool):

@@ -88,13 +88,13 @@ def test_past_speeds_are_those_of_the_drives_and_begin_with_the_label(labels, so
 
 def test_other_drives_than_the_frames_were_made_from_are_refused(labels, sources, folder, tmp_path):
     for wrong in ([source | {"digest": "0"} for source in sources], [source | {"name": "gone"} for source in sources]):
-        with pytest.raises(BadInputError, match="--ceiling false"):
+        with pytest.raises(BadInputError, match="state of --baselines"):
             true_state(labels, wrong, folder)
-    with pytest.raises(BadInputError, match="--ceiling false"):
+    with pytest.raises(BadInputError, match="state of --baselines"):
         true_state(labels, sources, tmp_path)
 
 
 def test_the_same_labels_and_drives_give_the_known_state(state):
-    """Code that changes the state must raise FORMAT_VERSIONS["state"], and then this digest."""
+    """Code that changes the state must raise FORMAT_VERSIONS["baseline"], and then this digest."""
     digest = hashlib.sha256(state.round(3).tobytes()).hexdigest()[:16]
-    assert (FORMAT_VERSIONS["state"], digest) == (1, "c49c36287c7d50f7")
+    assert (FORMAT_VERSIONS["baseline"], digest) == (1, "e70fcb2f5c841dca")

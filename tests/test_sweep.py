@@ -87,7 +87,7 @@ def test_a_finished_cell_computed_again_has_the_same_bytes(undisturbed):
         }
 
     before = kept()
-    completed = sweep(undisturbed.folder, "verify", *TINY_SWEEP, "--ceiling", "false")
+    completed = sweep(undisturbed.folder, "verify", *TINY_SWEEP, "--baselines", "[]")
     assert completed.returncode == 0, completed.stdout + completed.stderr
     assert "equal: curves, weights, samples and predictions, byte for byte" in completed.stdout
     assert kept() == before
@@ -106,7 +106,7 @@ def test_encoders_that_differ_by_their_seed_alone_show_no_effect(folder, tmp_pat
     """The real null study: four encoders of rec pose as the four head sets, in each of the 24 orders."""
     for name in ("sweeps", "data/episodes", "data/frames"):
         shutil.copytree(folder / name, tmp_path / name)
-    words = ("heads", *SMOKE, "--heads", "[rec]", "--encoder_seeds", "4", "--ceiling", "false", "--no-report")
+    words = ("heads", *SMOKE, "--heads", "[rec]", "--encoder_seeds", "4", "--baselines", "[]", "--no-report")
     completed = sweep(tmp_path, *words, "--workers", "2")
     assert completed.returncode == 0, completed.stderr
     words = [sys.executable, ROOT / "benchmarks/null_study.py", "heads", "--profile", "smoke"]

@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 Point = tuple[str, float]  # head set and data fraction
 Panel = dict[Point, pd.DataFrame]  # index (encoder_seed, policy_seed), one column for each epoch
 
-ACCURACY, STEERING = "acceleration_accuracy", "steering_loss"
+ACCURACY, STEERING, KEYFRAME = "acceleration_accuracy", "steering_loss", "keyframe_accuracy"
 LAST = 5  # epochs whose mean is a final score (Sec. V-B)
 
 

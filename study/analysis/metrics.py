@@ -14,7 +14,7 @@ import pandas as pd
 from pydantic import Field
 
 from study.analysis import learning_curves, predictions
-from study.analysis.learning_curves import ACCURACY, LAST, STEERING, Array
+from study.analysis.learning_curves import ACCURACY, KEYFRAME, LAST, STEERING, Array
 from study.config.paper import ACCELERATIONS
 from study.config.settings import Settings
 from study.results.cell_result import CellResult
@@ -100,6 +100,34 @@ METRICS: dict[str, Metric] = {
             guess="best constant command",
             about=f"Steering: smooth L1 loss, mean of the last {LAST} epochs.",
             values=late(STEERING),
+        ),
+        Metric(
+            name=KEYFRAME,
+            title="keyframes",
+            unit="%",
+            factor=100,
+            digits=2,
+            about="Keyframes: accuracy on frames whose class has changed within 0.5 s, where copying the last command "
+            f"fails, last {LAST} epochs.",
+            values=late(KEYFRAME),
+        ),
+        Metric(
+            name="natural_accuracy",
+            title="natural",
+            unit="%",
+            factor=100,
+            digits=2,
+            about="Natural: accuracy and steering loss with frames weighted to the distribution in driving, before "
+            f"balancing, last {LAST} epochs.",
+            values=late("natural_accuracy"),
+        ),
+        Metric(
+            name="natural_steering_loss",
+            title="natural steering",
+            unit="10⁻³",
+            factor=1e3,
+            better="lower",
+            values=late("natural_steering_loss"),
         ),
         Metric(
             name="balanced_accuracy",

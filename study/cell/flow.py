@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from study.cell.job import CellJob
-from study.config.heads import CEILING
 from study.errors import BadInputError
 from study.products import Product, read_product, write_product
 from study.results.cell_result import CellResult
@@ -29,11 +28,12 @@ STAGE_MODULE = "study.cell.stages"
 def cell_flow(job: CellJob, *, one_share: bool = False) -> Flow[tuple[CellResult, bytes]]:
     """Train the cell's encoder, encode the policy set, train its policies in shares, and assemble the result.
 
-    The ceiling has no encoder: its latents are the true state. With `one_share` all policies are trained at once,
-    which is fastest on a GPU. Returns the result and its network, an archive of torch.export, empty for the ceiling.
+    A baseline has no encoder: what its policies are given stands in the place of latents. With `one_share` all policies
+    are trained at once, which is fastest on a GPU. Returns the result and its network, an archive of torch.export,
+    empty for a baseline.
     """
     encoder = None
-    if job.cell.heads != CEILING:
+    if not job.cell.baseline:
         folder = job.products / f"encoder-{ENCODER.key(job.work)}"
         (encoder,) = yield from _keep([folder], ("weights", "samples"), [_task(ENCODER, "train_cell_encoder", job)])
     (latents,) = yield Batch([_task(LATENTS, "encode_policy_set", job, encoder)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pkgutil
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ import pandas as pd
 import torch
 from numpy.typing import NDArray
 
+from study.baselines.inputs import BaselineInputs
 from study.cell.job import CellJob
 from study.compute.device import choose_device, describe_determinism, device_name, peak_bytes
 from study.compute.provenance import provenance
@@ -23,7 +25,6 @@ from study.config.settings import SPEEDS
 from study.data.frames import FrameStore, open_frames
 from study.data.past_speeds import past_speeds
 from study.data.prepare import data_flow
-from study.data.true_state import true_state
 from study.driving.driver import export_driver
 from study.encoder.bounds import loss_bounds
 from study.encoder.latents import encode
@@ -35,7 +36,7 @@ from study.products import Arrays, Product
 from study.results.cell_result import NO_SEED, CellResult
 from study.stages import ENCODER
 
-PROBED = ("speed", "light", "lead_gap")  # columns of the labels that reports probe the latents for
+KEPT = ("speed", "light", "lead_gap", "keyframe", "weight")  # columns of the labels that reports need
 ENCODER_CURVES = ["split", "epoch", "metric", "value"]  # columns
 
 Reporter = Callable[..., None]  # see `Task`
@@ -78,15 +79,19 @@ def train_cell_encoder(job: CellJob, report: Reporter) -> Product:
 
 
 def encode_policy_set(job: CellJob, encoder: Product | None, report: Reporter) -> Latents:
-    """Return the latents of the policy set: the encoder's, or the true state."""
+    """Return the latents of the policy set: the encoder's, or what a baseline gives policies in their place."""
     started = time.perf_counter()
     store, device, facts = _begin(job, report)
     policy = store.policy
     part = policy.subset(job.settings.policy.share, "frame", job.settings.frames.seed)
     rows = {"train": part, "test": policy.indices("test")}
     if encoder is None:
-        state = true_state(policy.labels, store.manifest["sources"]["policy"], job.drives)
-        z = {split: state[indices] for split, indices in rows.items()}
+        inputs = BaselineInputs(
+            store, job.drives, job.settings, job.cell.encoder_seed, device, partial(report, "progress")
+        )
+        assert job.cell.baseline
+        given = pkgutil.resolve_name(job.cell.baseline.inputs)(inputs)
+        z = {split: given[indices] for split, indices in rows.items()}
     else:
         weights = encoder.parts["weights"]
         z = {split: encode(weights, policy.images, indices, device=device) for split, indices in rows.items()}
@@ -152,7 +157,7 @@ def assemble_result(
             "acceleration_label": labels["acceleration"].to_numpy(np.uint8),
             "steering_label": labels["steering"].to_numpy(np.float32),
             "episode": labels["episode"].to_numpy(np.int32),
-            **{name: labels[name].to_numpy() for name in PROBED},
+            **{name: labels[name].to_numpy() for name in KEPT},
             "z": latents.z_test[:, :LATENT],
         },
         facts={

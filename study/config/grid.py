@@ -6,7 +6,8 @@ from typing import Annotated, Any, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from study.config.heads import CEILING, HEAD_SETS, heads_of, load_heads
+from study.config.baselines import BASELINES, Baseline
+from study.config.heads import HEAD_SETS, heads_of, load_heads
 from study.config.settings import Count, NotNegative, Settings, Share
 from study.errors import BadInputError
 
@@ -59,7 +60,9 @@ class Grid(Settings):
     encoder_seeds: Count = Field(1, description="encoders for each head set and fraction")
     policy_seeds: Count = Field(15, description="policies on each encoder (Sec. V-A: 15)")
     baseline: str = Field("rec", description="head set that the others are compared with")
-    ceiling: bool = Field(default=True, description="one more cell: policies on the true state, as a ceiling")
+    baselines: tuple[str, ...] = Field(
+        tuple(BASELINES), description="cells without a head set to compare with (docs/reading-a-report.md); [] for none"
+    )
     claims: tuple[str, ...] = Field((), description="claims of the paper that this sweep tests")
     rules: Rules = Field(Rules(), description="when a claim counts as reproduced")
     settings: dict[str, Any] = Field(default_factory=dict, description="settings that differ from every profile's")
@@ -74,14 +77,17 @@ class Grid(Settings):
             heads_of(self.heads)
         except BadInputError as error:
             raise ValueError(f"a head set in study/config/heads.py has an {error}") from error
-        for name in ("heads", "fractions"):
+        for name in self.baselines:
+            if name not in BASELINES:
+                raise ValueError(f"unknown baseline '{name}'; choose from {', '.join(BASELINES)}, or [] for none")
+        for name in ("heads", "fractions", "baselines"):
             values = getattr(self, name)
             if len(set(values)) != len(values):
                 raise ValueError(f"{name}: {list(values)} names one twice")
         return self
 
     def cells(self) -> list[Cell]:
-        """Return the cells in the order to run: one encoder seed of everything first, the ceiling last."""
+        """Return the cells in the order to run: one encoder seed of everything first, the baselines last."""
         return [
             *(
                 Cell(heads=heads, fraction=fraction, encoder_seed=seed)
@@ -89,20 +95,33 @@ class Grid(Settings):
                 for fraction in self.fractions
                 for heads in self.heads
             ),
-            *[Cell(heads=CEILING)] * self.ceiling,
+            *(
+                Cell(heads=name, encoder_seed=seed)
+                for name in BASELINES
+                if name in self.baselines
+                for seed in range(BASELINES[name].seeds)
+            ),
         ]
 
 
 class Cell(Settings):
-    """One point of the grid: an encoder, and the policies on it."""
+    """One point of the grid: an encoder, and the policies on it.
+
+    `heads` names a head set or a baseline; a baseline has no encoder with heads.
+    """
 
     heads: str
     fraction: Fraction = 1.0
     encoder_seed: Annotated[int, Field(ge=0)] = 0
 
     @property
+    def baseline(self) -> Baseline | None:
+        """Return the record of the baseline that this cell is, if it is one."""
+        return BASELINES.get(self.heads)
+
+    @property
     def label(self) -> str:
         """Return a name for people, e.g. `rec+plan 100% e0`."""
-        if self.heads == CEILING:
-            return f"{CEILING} (ceiling)"
+        if self.baseline:
+            return self.heads + f" e{self.encoder_seed}" * (self.baseline.seeds > 1)
         return f"{self.heads} {self.fraction * 100:g}% e{self.encoder_seed}"

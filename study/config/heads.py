@@ -59,7 +59,6 @@ HEAD_SETS: dict[str, HeadSet] = {
     )
 }
 PAPER_MASKS = ("pred", "plan")  # targets in every frame store
-CEILING = "state"  # in the place of a head set: a cell without encoder, whose policies are given the true state
 
 
 def mask_heads() -> dict[str, Head]:

@@ -8,8 +8,9 @@ from typing import Any
 
 from pydantic import BaseModel
 
+from study.config.baselines import SUPERVISED
 from study.config.grid import Cell
-from study.config.heads import CEILING, HEAD_SETS, further_masks
+from study.config.heads import HEAD_SETS, further_masks
 from study.config.settings import StudySettings
 
 
@@ -26,7 +27,7 @@ def content_key(stage: str, settings: object, inputs: tuple[str, ...], format_ve
 
 
 # Raised on purpose when a stage's code changes what it makes; a test holds each product's digest.
-FORMAT_VERSIONS = {"episodes": 3, "frames": 2, "encoder": 3, "state": 1, "cell": 2}
+FORMAT_VERSIONS = {"episodes": 3, "frames": 3, "encoder": 3, "baseline": 1, "cell": 3}
 
 
 def recording_key(settings: StudySettings) -> str:
@@ -63,9 +64,11 @@ def frames_key(settings: StudySettings, source: str | None = None) -> str:
 
 
 def encoder_key(settings: StudySettings, cell: Cell, frames: str) -> str:
-    """Key of a trained encoder. What makes no difference at the full data is left out there."""
-    if cell.heads == CEILING:
-        return content_key("state", {}, (frames,), FORMAT_VERSIONS["state"])
+    """Key of a trained encoder, or of a baseline. What makes no difference at the full data is left out there."""
+    if cell.baseline:
+        training = settings.encoder.model_dump(mode="json", include={"batch", "lr"})
+        named = {"name": cell.heads, "seed": cell.encoder_seed} | (training if cell.heads == SUPERVISED else {})
+        return content_key("baseline", named, (frames,), FORMAT_VERSIONS["baseline"])
     parts: dict[str, Any] = {
         "encoder": settings.encoder.model_dump(mode="json", exclude={"budget", "head_weights"}),
         "heads": {head: settings.encoder.head_weights.get(head, 1.0) for head in HEAD_SETS[cell.heads].heads},

@@ -182,9 +182,10 @@ class _Build:
             last = first + len(self.paths[name])
             columns = {key: np.concatenate([table[key] for table in tables[first:last]]) for key in LABELS}
             first = last
-            rows, train, test_drives = choose(columns, name, wanted, len(self.paths[name]), self.frames)
+            rows, decided, test_drives = choose(columns, name, wanted, len(self.paths[name]), self.frames)
             before = histograms(columns, np.ones(len(columns["step"]), bool))
-            chosen = {key: values[rows] for key, values in columns.items()} | {"train": train}
+            chosen = {key: values[rows] for key, values in columns.items()} | decided
+            train = decided["train"]
             (self.draft / name).mkdir(parents=True)
             pd.DataFrame(chosen).to_parquet(self.draft / name / "labels.parquet", index=False)
             plan[name] = {

@@ -30,7 +30,7 @@ from study.episode.head import file_digest
 from study.errors import BadInputError
 from study.randomness import rng
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2  # 2: labels with keyframes, last commands, limits and weights
 PARTS = "parts"  # folder of the notes on what is painted
 
 Bytes = NDArray[np.uint8]

@@ -29,7 +29,7 @@ def past_speeds(
         if not (folder / "episode.json").is_file() or episode_digest(folder) != source["digest"]:
             raise BadInputError(
                 f"true speeds need the drives that the frames were made from, and {folder} is missing or has changed; "
-                "delete the frame store to make both again, or leave out what needs them: --ceiling false, "
+                "delete the frame store to make both again, or leave out what needs them: state of --baselines, "
                 "--policy.inputs z"
             )
         episode = read_episode(folder)

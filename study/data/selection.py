@@ -15,15 +15,17 @@ from numpy.typing import NDArray
 
 from study.config.paper import ACCELERATIONS, STEERING_CROP
 from study.config.settings import BirdviewSettings, FramesSettings
-from study.data.birdview import governing_light, valid_moments
+from study.data.birdview import Moments, governing_light, valid_moments
+from study.data.limits import speed_limits
 from study.episode.files import read_episode
-from study.episode.schema import RATE_HZ
+from study.episode.schema import RATE_HZ, Episode
 from study.errors import BadInputError
 from study.randomness import rng
 
 SETS = ("encoder", "policy")
 STEERING_EDGES = (-0.15, -0.05, -0.01, 0.01, 0.05, 0.15)  # of the bins that the policy set is raked to
 STANDING = 0.1  # [m/s], below it a vehicle stands
+KEYFRAME_STEPS = 5  # 0.5 s: the moments at which copying the last command fails (Wen et al. 2021)
 
 LABELS: dict[str, type[np.generic]] = {
     "episode": np.int32,  # position in the set's list of drives
@@ -37,6 +39,11 @@ LABELS: dict[str, type[np.generic]] = {
     "light_distance": np.float32,  # [m], NaN where there is none
     "lead_gap": np.float32,  # [m], NaN where the way is free
     "standing": np.bool_,
+    "limit": np.float32,  # speed limit of the nearest lane [m/s], NaN where unknown
+    "last_steering": np.float32,  # command of one step ago
+    "last_acceleration": np.int8,
+    "keyframe": np.bool_,  # whether the class of acceleration has changed within KEYFRAME_STEPS
+    "weight": np.float32,  # candidate moments that the frame stands for, mean 1: undoes the raking
 }
 
 Indices = NDArray[np.int64]
@@ -72,22 +79,41 @@ def candidates(path: Path, number: int, name: str, frames: FramesSettings, birdv
         "light_distance": episode.light_distance[at],
         "lead_gap": episode.lead_gap[at],
         "standing": episode.speed[at] < STANDING,
+        "limit": speed_limits(episode, moments),
+        **_commands_before(episode, moments),
+        "weight": np.ones(len(moments)),
     }
     return {name: columns[name].astype(kind, copy=False) for name, kind in LABELS.items()}
 
 
+def _commands_before(episode: Episode, moments: Moments) -> Columns:
+    """Return the last command before each moment, and whether the class has changed; an unknown one has not."""
+    steps, agents = moments.T
+    now = episode.acceleration[steps, agents]
+    changed = np.zeros(len(moments), bool)
+    for back in range(1, KEYFRAME_STEPS + 1):
+        before = episode.acceleration[np.maximum(steps - back, 0), agents]
+        changed |= np.isfinite(before) & (before != now)
+    steering, acceleration = (
+        np.nan_to_num(values[np.maximum(steps - 1, 0), agents]) for values in (episode.steering, episode.acceleration)
+    )
+    classes = np.searchsorted(ACCELERATIONS, acceleration)
+    return {"last_steering": steering, "last_acceleration": classes, "keyframe": changed}
+
+
 def choose(
     columns: Columns, name: str, wanted: int, drives: int, settings: FramesSettings
-) -> tuple[Indices, NDArray[np.bool_], list[int]]:
-    """Return the rows of the chosen candidates, sorted, whether each is for training, and the test drives (Sec. V)."""
+) -> tuple[Indices, Columns, list[int]]:
+    """Return the rows of the chosen candidates, sorted, their columns "train" and "weight", and the test drives."""
     generator = rng(settings.seed, f"frames {name}")
     test = round(wanted * settings.test_share)
     balance = settings.balance if name == "policy" else "none"
     if settings.split == "frame":
-        rows = _sample(columns, np.arange(len(columns["step"])), wanted, balance, name, "", settings, generator)
+        pool = np.arange(len(columns["step"]))
+        rows, weight = _sample(columns, pool, wanted, balance, name, "", settings, generator)
         train = np.ones(wanted, bool)
         train[generator.permutation(wanted)[:test]] = False
-        return rows, train, []
+        return rows, {"train": train, "weight": weight}, []
     count = min(max(1, round(drives * settings.test_share)), drives - 1)
     test_drives = np.sort(generator.permutation(drives)[:count])
     in_test = np.isin(columns["episode"], test_drives)
@@ -95,8 +121,9 @@ def choose(
         _sample(columns, np.flatnonzero(pool), number, balance, name, f" {split}", settings, generator)
         for pool, number, split in ((~in_test, wanted - test, "training"), (in_test, test, "test"))
     ]
-    rows = np.sort(np.concatenate(parts))
-    return rows, ~in_test[rows], test_drives.tolist()
+    rows, weight = (np.concatenate(part) for part in zip(*parts, strict=True))
+    order = np.argsort(rows, kind="stable")
+    return rows[order], {"train": ~in_test[rows[order]], "weight": weight[order]}, test_drives.tolist()
 
 
 def _sample(
@@ -108,8 +135,11 @@ def _sample(
     split: str,
     settings: FramesSettings,
     generator: np.random.Generator,
-) -> Indices:
-    """Draw `wanted` rows of the pool without replacement, sorted; raked to the targets unless `balance` is none."""
+) -> tuple[Indices, NDArray[np.float32]]:
+    """Draw `wanted` rows of the pool without replacement, sorted; raked to the targets unless `balance` is none.
+
+    Returns the rows and their weights, mean 1: weighted, they are distributed as the pool is.
+    """
     if wanted > len(pool):
         raise BadInputError(
             f"the {name} set needs {wanted}{split} frames and its drives give {len(pool)}: lower "
@@ -117,14 +147,16 @@ def _sample(
             "(import more drives, if they are yours)"
         )
     if balance == "none":
-        return np.sort(generator.permutation(pool)[:wanted])
+        return np.sort(generator.permutation(pool)[:wanted]), np.ones(wanted, np.float32)
     cell, shape, margins = _cells(columns, pool, balance, settings)
     available = np.bincount(cell, minlength=int(np.prod(shape))).reshape(shape)
     counts = rake(available, margins, wanted, settings.weight_cap).reshape(-1)
     order = np.lexsort((generator.random(len(pool)), cell))
     first = np.searchsorted(cell[order], np.arange(len(counts)))
     rank = np.arange(len(pool)) - first[cell[order]]
-    return np.sort(pool[order[rank < counts[cell[order]]]])
+    chosen = np.sort(order[rank < counts[cell[order]]])
+    weight = (available.reshape(-1) / np.maximum(counts, 1))[cell[chosen]]
+    return pool[chosen], (weight / weight.mean()).astype(np.float32)
 
 
 def _cells(

@@ -14,7 +14,7 @@ from study.config.heads import HEAD_SETS, HEADS
 from study.config.paper import LATENT
 from study.config.settings import EncoderSettings
 from study.encoder.inputs import Split, mask_places, to_float, unpack
-from study.encoder.networks import PIXELS, Decoder, Encoder, initialise, seeded_generator
+from study.encoder.networks import PIXELS, Decoder, initialise, seeded_generator, untrained_encoder
 from study.errors import one_of
 
 LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {  # by the name in a head's record; logits, target -> mean
@@ -47,11 +47,10 @@ class MultiHeadAutoencoder(lightning.LightningModule):
             head: settings.head_weights.get(head, 1.0) * _numbers(head, settings) for head in HEAD_SETS[heads].heads
         }
         self.automatic_optimization = False  # gradients come head by head, see `losses`
-        self.encoder = Encoder(variational=settings.beta > 0)
+        self.encoder = untrained_encoder(encoder_seed, variational=settings.beta > 0)
         self._head_losses = {head: LOSSES[HEADS[head].loss] for head in self.head_weights}
         self._mask_places = mask_places(self.head_weights)
         self.decoders = nn.ModuleDict({head: Decoder(HEADS[head].channels) for head in HEAD_SETS[heads].heads})
-        initialise(self.encoder, seeded_generator(encoder_seed, "encoder weights"))
         for head, decoder in self.decoders.items():
             initialise(decoder, seeded_generator(encoder_seed, f"decoder weights {head}"))
         self.metrics = ("loss", *(f"loss_{head}" for head in self.decoders), *(["loss_kl"] if settings.beta else []))

@@ -146,6 +146,13 @@ def initialise(network: nn.Module, generator: torch.Generator) -> None:
                     layer.bias.uniform_(-bound, bound, generator=generator)
 
 
+def untrained_encoder(seed: int, *, variational: bool = False) -> Encoder:
+    """Return an encoder with the initial weights of that seed."""
+    encoder = Encoder(variational)
+    initialise(encoder, seeded_generator(seed, "encoder weights"))
+    return encoder
+
+
 def seeded_generator(seed: int, purpose: str, device: torch.device | str = "cpu") -> torch.Generator:
     """Return torch's generator of one purpose of a seed (see `rng`)."""
     return torch.Generator(device).manual_seed(int(rng(seed, purpose).integers(2**63)))

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from study.config.heads import HeadSet
 from study.figures.style import FRACTION_COLOUR, FRACTION_MARKER, GREY, STYLE, literal, look, new_figure
 
-CEILING_LINE, CEILING_WORDS = ":", "true state"
+STEERING, ACCURACY = "steering_loss", "acceleration_accuracy"
 LATE = 0.05  # share of the epochs after which the axis of a curve shows everything
 
 
@@ -29,14 +29,15 @@ def compare_heads(
     steering_floor: float,
     accuracy_floor: float,
     split: str = "test",
-    ceiling: pd.DataFrame | None = None,
+    baselines: Mapping[str, pd.DataFrame] | None = None,
 ) -> Figure:
     """Draw steering loss and acceleration accuracy by epoch (fig:test_compare_heads, fig:train_compare_heads).
 
     All tables are those of `analysis.intervals.curve_bands` at one fraction: mean line, band of one standard deviation
-    over seeds, darker band for the 95 % interval of the mean. `ceiling`: accuracy of policies on the true state.
+    over seeds, darker band for the 95 % interval of the mean. `baselines`: for each metric the bands of baselines, of
+    which the mean is drawn.
     """
-    figure, panels = new_figure(2.6, columns=2)
+    figure, panels = new_figure(3.0, columns=2)
     for axes, bands, scale in zip(panels, (steering, accuracy), (1000.0, 100.0), strict=True):
         ends = []
         for index, (name, rows) in enumerate(bands.groupby("heads", sort=False)):
@@ -45,10 +46,12 @@ def compare_heads(
         if axes is panels[0]:
             axes.set_title(f"(a) Steering loss, {split}")
             _loss_axis(axes, bands, steering_floor)
+            ends += _baselines(axes, (baselines or {}).get(STEERING), scale)
         else:
+            others = (baselines or {}).get(ACCURACY)
             axes.set_title(f"(b) Acceleration accuracy, {split}")
-            _accuracy_axis(axes, bands, accuracy_floor, _top(ceiling))
-            ends += _ceiling(axes, ceiling)
+            _accuracy_axis(axes, bands, accuracy_floor, others)
+            ends += _baselines(axes, others, scale)
         _label_ends(axes, ends)
     return figure
 
@@ -59,11 +62,11 @@ def converge_speed(
     baseline: str,
     reached: Mapping[float, float],
     accuracy_floor: float,
-    ceiling: pd.DataFrame | None = None,
+    baselines: pd.DataFrame | None = None,
 ) -> Figure:
     """Draw test accuracy by epoch: full at every fraction, the baseline at the largest (fig:datasize_convergespeed).
 
-    `accuracy`, `ceiling`: `analysis.intervals.curve_bands`; `reached`: fraction -> epoch at which full's mean curve
+    `accuracy`, `baselines`: `analysis.intervals.curve_bands`; `reached`: fraction -> epoch at which full's mean curve
     reaches the baseline's final accuracy, infinite when never.
     """
     figure, (axes,) = new_figure(3.4)
@@ -77,7 +80,7 @@ def converge_speed(
         colours[float(str(fraction))] = colour
     heads = look(baseline)
     ends.append(_curve(axes, base, 100.0, f"{baseline}, {_percent(top)}", heads.colour, "--", heads.marker, 0))
-    _accuracy_axis(axes, pd.concat([others, base]), accuracy_floor, _top(ceiling))
+    _accuracy_axis(axes, pd.concat([others, base]), accuracy_floor, baselines)
     goal = 100 * float(base["mean"].iloc[-5:].mean())
     axes.axhline(goal, color=GREY, linewidth=0.6, linestyle=":")
     for fraction, colour in colours.items():
@@ -85,7 +88,7 @@ def converge_speed(
         if np.isfinite(epoch):
             axes.plot([epoch, epoch], [axes.get_ylim()[0], goal], color=colour, linewidth=0.6, linestyle=":")
     axes.set_ylabel("acceleration accuracy, test [%]")
-    _label_ends(axes, ends + _ceiling(axes, ceiling))
+    _label_ends(axes, ends + _baselines(axes, baselines, 100.0))
     return figure
 
 
@@ -121,26 +124,27 @@ def _loss_axis(axes: Axes, bands: pd.DataFrame, floor: float) -> None:
     _floor(axes, floor, "best constant ", "" if floor <= high else f"best constant command, above: {floor:.2f}", "top")
 
 
-def _top(ceiling: pd.DataFrame | None) -> float:
-    return 0.0 if ceiling is None else float(ceiling["mean"].max())
+def _baselines(axes: Axes, bands: pd.DataFrame | None, scale: float) -> list[End]:
+    """Draw the mean curves of baselines, thin and without bands, and return the labels of those that end in sight."""
+    ends: list[End] = []
+    low, high = axes.get_ylim()
+    for name, rows in () if bands is None else bands.groupby("heads", sort=False):
+        shown, last = look(str(name)), scale * float(rows["mean"].iloc[-1])
+        axes.plot(rows["epoch"], scale * rows["mean"], shown.line, color=shown.colour, linewidth=0.8)
+        ends += [(last, shown.word, shown.colour)] if low <= last <= high else []
+    axes.set_ylim(low, high)
+    return ends
 
 
-def _ceiling(axes: Axes, bands: pd.DataFrame | None) -> list[End]:
-    """Draw the curve of the true state, without a band, and return the label for its end."""
-    if bands is None:
-        return []
-    axes.plot(bands["epoch"], 100 * bands["mean"], CEILING_LINE, color=GREY, linewidth=0.8)
-    return [(100 * float(bands["mean"].iloc[-1]), CEILING_WORDS, GREY)]
-
-
-def _accuracy_axis(axes: Axes, bands: pd.DataFrame, floor: float, top: float) -> None:
+def _accuracy_axis(axes: Axes, bands: pd.DataFrame, floor: float, baselines: pd.DataFrame | None) -> None:
     """Cut the axis below the curves, and say so: the majority class's accuracy is named where it is not in sight.
 
-    It reaches up to `top`, the ceiling, at least.
+    It shows where the curves of the baselines end.
     """
     part, floor = _settled(bands), 100 * floor
-    low = 100 * float((part["mean"] - part["sd"].fillna(0)).min())
-    high = 100 * max(float((part["mean"] + part["sd"].fillna(0)).max()), top)
+    ends = [] if baselines is None else baselines.groupby("heads")["mean"].last().tolist()
+    low = 100 * min([float((part["mean"] - part["sd"].fillna(0)).min()), *ends])
+    high = 100 * max([float((part["mean"] + part["sd"].fillna(0)).max()), *ends])
     pad = 0.06 * (high - low)
     low, high = max(low - 2 * pad, 0), min(high + pad, 100)
     axes.set_ylim(low, high)
@@ -226,22 +230,23 @@ def encoder_losses(lines: Sequence[tuple[str, str, float, pd.Series]], constants
 
 @mpl.rc_context(STYLE)
 def compare_fractions(
-    scores: pd.DataFrame, steering_floor: float, accuracy_floor: float, ceiling: float | None = None
+    scores: pd.DataFrame, steering_floor: float, accuracy_floor: float, baselines: pd.DataFrame | None = None
 ) -> Figure:
     """Draw the mean of the last five epochs by data fraction (fig:datasize_compare).
 
     `scores`: one row for each cell and metric, columns metric (steering_loss, acceleration_accuracy), heads, fraction,
-    mean, sd, low, high. Thin bar: one standard deviation over seeds; thick bar: 95 % interval of the mean. `ceiling`:
-    accuracy of policies on the true state.
+    mean, sd, low, high. Thin bar: one standard deviation over seeds; thick bar: 95 % interval of the mean. `baselines`:
+    rows with metric, heads and mean, drawn as lines, since they do not depend on the fraction.
     """
-    figure, panels = new_figure(2.6, columns=2)
-    metrics = ("steering_loss", "acceleration_accuracy")
+    figure, panels = new_figure(3.0, columns=2)
+    metrics = (STEERING, ACCURACY)
     for axes, metric, scale in zip(panels, metrics, (1000.0, 100.0), strict=True):
         shown, ends = scores[scores["metric"] == metric], []
         for index, (name, rows) in enumerate(shown.groupby("heads", sort=False)):
             heads, points = look(str(name)), rows.sort_values("fraction")
             ends.append((scale * float(points["mean"].iloc[-1]), heads.name, heads.colour))
             _bars(axes, points, scale, heads, shift=1 + 0.03 * index)
+        levels = None if baselines is None else baselines[baselines["metric"] == metric]
         ticks = sorted(shown["fraction"].unique())
         axes.set(xscale="log", xlabel="share of the encoder's training data [%]")
         axes.set_xticks(ticks, [f"{100 * tick:g}" for tick in ticks])
@@ -252,10 +257,10 @@ def compare_fractions(
             _loss_axis(axes, shown.assign(epoch=1), steering_floor)
         else:
             axes.set_title("(b) Acceleration accuracy, test")
-            _accuracy_axis(axes, shown.assign(epoch=1), accuracy_floor, ceiling or 0.0)
-            if ceiling:
-                axes.axhline(100 * ceiling, color=GREY, linewidth=0.8, linestyle=CEILING_LINE)
-                ends.append((100 * ceiling, CEILING_WORDS, GREY))
+            _accuracy_axis(axes, shown.assign(epoch=1), accuracy_floor, levels)
+        if levels is not None:
+            across = pd.concat([levels.assign(epoch=x) for x in axes.get_xlim()])
+            ends += _baselines(axes, across, scale)
         _label_ends(axes, ends)
     return figure
 

@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from study.atomic import write_atomic
+from study.config.baselines import BASELINES
 from study.config.heads import HEAD_SETS, HeadSet
 
 BLUE, VERMILION = "#0072B2", "#D55E00"
@@ -52,7 +53,9 @@ METADATA: dict[str, dict[str, None]] = {  # of each format, what would say when 
 
 
 def look(name: str) -> HeadSet:
-    """Return the colour, line and marker of a head set; one without a record gets a colour by its name."""
+    """Return colour, line and marker of a head set or baseline; what has no record gets a colour by its name."""
+    if baseline := BASELINES.get(name):
+        return HeadSet(name, (), baseline.word, baseline.colour, baseline.line, "")
     colour = FURTHER[zlib.crc32(name.encode()) % len(FURTHER)]
     return HEAD_SETS.get(name) or HeadSet(name, (), name, colour, ":", "v")
 

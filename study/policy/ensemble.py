@@ -48,7 +48,7 @@ class PolicyData:
 class PolicyEnsemble(lightning.LightningModule):
     """S policies as stacked tensors: for each network a row of numbers a seed, and its layers as views of the rows.
 
-    One training step is one batch of every seed. `after_epoch(epoch, {split: METRICS [4, S]})` is called after each
+    One training step is one batch of every seed. `after_epoch(epoch, {split: METRICS [7, S]})` is called after each
     epoch; only then does the process wait for a GPU.
     """
 

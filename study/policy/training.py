@@ -59,7 +59,7 @@ def train_policies(
     log: Log | None = None,
     progress: Progress | None = None,
 ) -> TrainedPolicies:
-    """Train one policy per seed on latents and labels with columns "steering" and "acceleration".
+    """Train one policy per seed on latents and labels with the columns of `Labels`.
 
     Latents are [N, Z] float32 with the Z of `settings.width`. Train metrics are taken on a random part of the train
     split, the same for all seeds and epochs, that is no larger than the test split.
@@ -173,10 +173,9 @@ def _check(
 
 def _policy_data(scaling: Arrays, train: Labelled, test: Labelled, device: torch.device) -> PolicyData:
     def on_device(z: NDArray[np.float32], labels: pd.DataFrame) -> tuple[Tensor, Labels]:
-        commands = labels["steering"].to_numpy(np.float32), labels["acceleration"].to_numpy(np.int64)
-        return torch.from_numpy(normalise(scaling, z)).to(device), Labels(
-            *(torch.tensor(c).to(device) for c in commands)
-        )
+        columns = {"steering": np.float32, "acceleration": np.int64, "keyframe": np.float32, "weight": np.float32}
+        values = Labels(*(torch.tensor(labels[name].to_numpy(kind)).to(device) for name, kind in columns.items()))
+        return torch.from_numpy(normalise(scaling, z)).to(device), values
 
     (x_train, y_train), view = on_device(*train), on_device(*test)
     drawn = rng(0, "policy train metrics").permutation(len(x_train))[: len(view[0])]

@@ -41,7 +41,7 @@ def build_report(record: SweepRecord, folder: Path = HERE.reports) -> Path:
         if file not in written:  # of an earlier report with other cells
             file.unlink()
     write_atomic(files / "report.json", report.json())
-    write_atomic(files / "curves.parquet", record.table(ceiling=True).to_parquet(index=False))
+    write_atomic(files / "curves.parquet", record.table(baselines=True).to_parquet(index=False))
     pictures = {f"figures/{file.name}": file.read_bytes() for file in written if file.suffix == ".svg"}
     pdf = folder / f"{record.grid.name}.pdf"
     sweep = report.sweep

@@ -16,6 +16,7 @@ from study.analysis.effects import MINUS, ordered
 from study.analysis.intervals import Estimate
 from study.analysis.learning_curves import ACCURACY, Point
 from study.analysis.metrics import Metric
+from study.config.baselines import BASELINES
 from study.config.grid import Cell
 from study.report.document import Block, Inline, bold, code, italic, lines, plain, table
 from study.report.model import Report, Score, Spread
@@ -62,12 +63,16 @@ def compare(first: Report, second: Report, names: tuple[str, str], picture: str 
 
 
 def labels(first: Report, second: Report) -> dict[Point, str]:
-    """Return the head sets and fractions that either has scores of, most data first, with names to tell them apart."""
+    """Return the points that either has scores of, most data first, baselines last, with names to tell them apart."""
     points = {*first.by_point, *second.by_point}
-    heads = ordered(sorted(name for name, _ in points))
-    cells = sorted(points, key=lambda point: (-point[1], heads.index(point[0])))
+    heads = ordered(sorted(name for name, _ in points if name not in BASELINES))
+    cells = sorted(
+        (point for point in points if point[0] in heads), key=lambda point: (-point[1], heads.index(point[0]))
+    )
     several = len({fraction for _, fraction in cells}) > 1
-    return {(name, part): f"{name} at {100 * part:g} %" if several else name for name, part in cells}
+    named = {(name, part): f"{name} at {100 * part:g} %" if several else name for name, part in cells}
+    beside = {(name, 1.0): record.word for name, record in BASELINES.items() if (name, 1.0) in points}
+    return named | beside
 
 
 def side_key(word: str, report: Report, name: str, most: int = 60) -> str:
@@ -78,14 +83,10 @@ def side_key(word: str, report: Report, name: str, most: int = 60) -> str:
 
 
 def ends_text(first: Report, second: Report) -> str:
-    """Return floor and ceiling of accuracy in words, of both sweeps where they differ."""
+    """Return the floor of accuracy in words, of both sweeps where they differ."""
     floors = [side.floor[ACCURACY] for side in (first, second)]
-    tops = [side.ceiling.mean for side in (first, second) if side.ceiling]
-    parts = ["(a): axis cut"]
-    for word, values in (("majority class", floors), ("true state", tops)):
-        shown = dict.fromkeys(f"{100 * value:.1f}" for value in values if not math.isnan(value))
-        parts += [f"{word} at {' and '.join(shown)} %"] if shown else []
-    return "; ".join(parts)
+    shown = dict.fromkeys(f"{100 * value:.1f}" for value in floors if not math.isnan(value))
+    return "; ".join(["(a): axis cut", *[f"majority class at {' and '.join(shown)} %"] * bool(shown)])
 
 
 def _mean(side: Report, point: Point) -> str:
@@ -142,23 +143,20 @@ def _spreads(sides: Sides, name: str, point: Point) -> list[Spread | None]:
 
 def _changes(sides: Sides, name: str, both: list[Point]) -> list[Estimate]:
     pairs = [_spreads(sides, name, point) for point in both]
-    pairs += [[side.ceiling for side in sides]] if name == ACCURACY else []
     return [difference(one, other) for one, other in pairs if one and other]
 
 
 def _scores(sides: Sides, metric: Metric, cells: dict[Point, str], both: list[Point]) -> Inline:
-    """Return a metric's table; that of accuracy has shares of the possible gain where both have a ceiling."""
-    ceilings = [side.ceiling for side in sides] if metric.name == ACCURACY else [None, None]
+    """Return a metric's table; that of accuracy has shares of the possible gain where both have its ends."""
     header: list[str] = [title(metric), "first (n)", "second (n)", "difference", "95 %"]
     rows: Rows = [[cells[point], *_beside(metric, *_spreads(sides, metric.name, point))] for point in both]
-    if any(ceilings):
-        rows.append([italic("ceiling (true state)"), *_beside(metric, *ceilings)])
+    with_shares = metric.name == ACCURACY and all(side.ceiling and side.trivial for side in sides)
     if metric.guess:
         floors = [show(metric, side.floor.get(metric.name)) for side in sides]
         rows.append([italic(f"floor ({metric.guess})"), *floors, NOTHING, NOTHING])
-    if all(ceilings):
+    if with_shares:
         header += ["share of gain, first [%]", "share of gain, second [%]"]
-        shares = [*([side.by_point[point].share for side in sides] for point in both), [1.0, 1.0], [0.0, 0.0]]
+        shares = [*([side.by_point[point].share for side in sides] for point in both), [math.nan, math.nan]]
         rows = [[*row, *(percent(share, 0) for share in pair)] for row, pair in zip(rows, shares, strict=True)]
     return table(header, rows)
 
@@ -194,7 +192,7 @@ def _shared(sides: Sides, point: Point) -> str:
 
 
 def _keys(report: Report, point: Point) -> list[str]:
-    seeds = range(report.sweep.encoder_seeds)
+    seeds = range(BASELINES[point[0]].seeds if point[0] in BASELINES else report.sweep.encoder_seeds)
     cells = [Cell(heads=point[0], fraction=point[1], encoder_seed=seed).label for seed in seeds]
     return [report.provenance.keys[label] for label in cells if label in report.provenance.keys]
 

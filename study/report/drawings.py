@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import asdict
 
 import numpy as np
@@ -12,13 +13,14 @@ from numpy.typing import NDArray
 from study.analysis import effects, intervals, learning_curves, predictions
 from study.analysis.intervals import Estimate
 from study.analysis.learning_curves import ACCURACY, STEERING
-from study.config.heads import CEILING, HEADS
+from study.config.baselines import BASELINES
+from study.config.heads import HEADS
 from study.errors import BadInputError
 from study.figures import curves, differences, pictures
 from study.figures.style import Drawing
 from study.products import Arrays
 from study.report.comparison import ends_text, labels, side_key
-from study.report.model import Report, VariedSetting
+from study.report.model import Report, Score, VariedSetting
 from study.results.cell_result import CellResult
 from study.results.sweep_record import SweepRecord
 
@@ -48,15 +50,17 @@ def draw(record: SweepRecord, report: Report) -> dict[str, Drawing]:
 def _heads(record: SweepRecord, report: Report, split: str) -> Drawing:
     table, floor = record.table(), report.floor
     steering, accuracy = (intervals.curve_bands(table, metric, split) for metric in (STEERING, ACCURACY))
-    return curves.compare_heads(steering, accuracy, floor[STEERING], floor[ACCURACY], split, _ceiling(record, split))
+    beside = {
+        metric: bands for metric in (STEERING, ACCURACY) if (bands := _baselines(record, metric, split)) is not None
+    }
+    return curves.compare_heads(steering, accuracy, floor[STEERING], floor[ACCURACY], split, beside)
 
 
-def _ceiling(record: SweepRecord, split: str = "test") -> pd.DataFrame | None:
-    """Return the accuracy of policies on the true state by epoch."""
-    if record.ceiling is None:
-        return None
-    table = record.table(ceiling=True)
-    return intervals.curve_bands(table[table["heads"] == CEILING], ACCURACY, split)
+def _baselines(record: SweepRecord, metric: str = ACCURACY, split: str = "test") -> pd.DataFrame | None:
+    """Return the baselines' curves by epoch, where any is finished."""
+    table = record.table(baselines=True)
+    bands = intervals.curve_bands(table[table["heads"].isin(BASELINES)], metric, split)
+    return bands if len(bands) else None
 
 
 def _speed(record: SweepRecord, report: Report) -> Drawing | None:
@@ -64,17 +68,21 @@ def _speed(record: SweepRecord, report: Report) -> Drawing | None:
     if not reached:
         return None
     bands = intervals.curve_bands(record.table(), ACCURACY)
-    return curves.converge_speed(bands, report.sweep.baseline, reached, report.floor[ACCURACY], _ceiling(record))
+    return curves.converge_speed(bands, report.sweep.baseline, reached, report.floor[ACCURACY], _baselines(record))
 
 
 def _fractions(report: Report) -> Drawing:
-    rows = [
-        {"metric": metric, "heads": score.heads, "fraction": score.fraction, **score.metrics[metric].model_dump()}
-        for score in report.scores
-        for metric in (ACCURACY, STEERING)
-    ]
-    ceiling = report.ceiling.mean if report.ceiling else None
-    return curves.compare_fractions(pd.DataFrame(rows), report.floor[STEERING], report.floor[ACCURACY], ceiling)
+    def rows(scores: Iterable[Score]) -> pd.DataFrame:
+        return pd.DataFrame(
+            [
+                {"metric": name, "heads": row.heads, "fraction": row.fraction, **row.metrics[name].model_dump()}
+                for row in scores
+                for name in (ACCURACY, STEERING)
+            ]
+        )
+
+    beside = rows(report.baselines) if report.baselines else None
+    return curves.compare_fractions(rows(report.scores), report.floor[STEERING], report.floor[ACCURACY], beside)
 
 
 def _differences(report: Report) -> Drawing | None:

@@ -18,11 +18,12 @@ from study.analysis.effects import Contrast, Interval
 from study.analysis.intervals import Estimate
 from study.analysis.learning_curves import Point
 from study.analysis.metrics import Metric
+from study.config.baselines import BASELINES, CEILING
 from study.config.files import validated
 from study.config.settings import Number, Settings
 from study.errors import BadInputError
 
-FORMAT_VERSION = 2  # 2: scores by name of the metric, with the metrics' records
+FORMAT_VERSION = 3  # 3: baselines beside the head sets
 
 
 class Part(Settings, extra="ignore"):
@@ -88,12 +89,12 @@ class Spread(Part):
 class Score(Part):
     """What is known of a finished cell.
 
-    `metrics`: final scores by name of the metric; `gain`: accuracy above the floor; `share`: its part of the possible
-    gain below a ceiling; `confusion`: the share of each true class (row) that is given each class after the last epoch;
-    `components`: standard deviations of accuracy between encoders, policies and epochs; `losses`: those of each head on
-    each split after the last epoch, with the entropy of its test targets and the test loss of the constant picture
-    (study.encoder.bounds), mean over encoders; `probes`: the share of each quantity's variance that a linear
-    model reads off the latents, mean over encoders.
+    `metrics`: final scores by name of the metric; `gain`: accuracy above the best trivial baseline; `share`: its part
+    of the way from there to the ceiling; `confusion`: the share of each true class (row) that is given each class after
+    the last epoch; `components`: standard deviations of accuracy between encoders, policies and epochs; `losses`: those
+    of each head on each split after the last epoch, with the entropy of its test targets and the test loss of the
+    constant picture (study.encoder.bounds), mean over encoders; `probes`: the share of each quantity's variance that a
+    linear model reads off the latents, mean over encoders.
     """
 
     cell: str
@@ -217,8 +218,8 @@ class Report(Part):
     scale: tuple[Scale, ...] = ()
     metrics: tuple[Metric, ...]
     floor: dict[str, Number]
-    ceiling: Spread | None = None
     scores: tuple[Score, ...]
+    baselines: tuple[Score, ...] = ()
     comparisons: tuple[Contrast, ...]
     planned_contrasts: int
     convergence: tuple[Convergence, ...]
@@ -234,8 +235,19 @@ class Report(Part):
 
     @property
     def by_point(self) -> dict[Point, Score]:
-        """Return the scores by head set and fraction."""
-        return {row.point: row for row in self.scores}
+        """Return the scores of head sets by name and fraction, then those of the baselines."""
+        return {row.point: row for row in (*self.scores, *self.baselines)}
+
+    @property
+    def ceiling(self) -> Spread | None:
+        """Return the accuracy of policies on the true state, where they were trained."""
+        return next((row.accuracy for row in self.baselines if row.heads == CEILING), None)
+
+    @property
+    def trivial(self) -> Score | None:
+        """Return the best baseline that has learned nothing from driving, where there is one."""
+        rows = [row for row in self.baselines if (known := BASELINES.get(row.heads)) and known.trivial]
+        return max(rows, key=lambda row: row.accuracy.mean, default=None)
 
     @property
     def outcomes(self) -> dict[str, list[str]]:

@@ -14,6 +14,7 @@ import pandas as pd
 from study.analysis import claims, confounds, convergence, effects, intervals, learning_curves, metrics, predictions
 from study.analysis.learning_curves import ACCURACY, STEERING, Point
 from study.analysis.metrics import METRICS
+from study.config.baselines import BASELINES, CEILING
 from study.config.heads import HEADS, heads_of
 from study.config.paper import parameter_counts
 from study.products import Arrays
@@ -48,15 +49,18 @@ def summarise(record: SweepRecord) -> Report:
     accuracy = panels[ACCURACY]
     finished = {point: accuracy[point] for point in effects.points(grid) if point in accuracy}
     base = accuracy.get((grid.baseline, max(grid.fractions)))
-    floor, ceiling, counts = _floor(record), _ceiling(record), parameter_counts()
+    floor, counts = _floor(record), parameter_counts()
+    beside, ends = _baselines(record)
     contrasts = (effects.paired_contrasts(record, name, panel) for name, panel in panels.items())
     return Report(
         sweep=_sweep(record, "A" if learning_curves.design(accuracy.values()) == "A" else "B"),
         scale=training_scale(record),
         metrics=tuple(METRICS.values()),
         floor=floor,
-        ceiling=ceiling,
-        scores=tuple(_score(record, point, curves, floor[ACCURACY], ceiling) for point, curves in finished.items()),
+        scores=tuple(
+            _score(record, point, effects.label(point, grid), curves, ends) for point, curves in finished.items()
+        ),
+        baselines=beside,
         comparisons=tuple(itertools.chain.from_iterable(contrasts)),
         planned_contrasts=len(effects.planned(grid)),
         convergence=tuple(
@@ -111,9 +115,15 @@ def _floor(record: SweepRecord) -> dict[str, float]:
     return {ACCURACY: math.nan, STEERING: math.nan}
 
 
-def _ceiling(record: SweepRecord) -> Spread | None:
-    """Return the accuracy of policies that are given the true state, where they were trained."""
-    return _spread(metrics.scores([record.ceiling], METRICS[ACCURACY])) if record.ceiling else None
+def _baselines(record: SweepRecord) -> tuple[tuple[Score, ...], tuple[float, float]]:
+    """Return the baselines' scores, and the accuracies of the best trivial one and of the ceiling, NaN for none."""
+    curves = learning_curves.panel(record.table(baselines=True), ACCURACY)
+    finished = {point: frame for point, frame in curves.items() if point[0] in BASELINES}
+    means = {name: float(learning_curves.final(frame).mean()) for (name, _), frame in finished.items()}
+    trivial = [mean for name, mean in means.items() if BASELINES[name].trivial]
+    ends = max(trivial, default=math.nan), means.get(CEILING, math.nan)
+    words = {point: BASELINES[point[0]].word for point in finished}
+    return tuple(_score(record, point, words[point], frame, ends) for point, frame in finished.items()), ends
 
 
 def _spread(scores: pd.Series) -> Spread:
@@ -130,23 +140,24 @@ def _spread(scores: pd.Series) -> Spread:
     )
 
 
-def _score(record: SweepRecord, point: Point, curves: pd.DataFrame, floor: float, ceiling: Spread | None) -> Score:
+def _score(record: SweepRecord, point: Point, cell: str, curves: pd.DataFrame, ends: tuple[float, float]) -> Score:
+    """Return what is known of a cell; `ends`: accuracies of the best trivial baseline and of the ceiling."""
     results = effects.results_at(record, point)
     recall = [
         predictions.confusion(result.predictions["acceleration"], result.predictions["acceleration_label"])
         for result in results
     ]
     scores = {name: metrics.scores(results, metric) for name, metric in METRICS.items()}
-    gain = float(scores[ACCURACY].mean()) - floor
+    gain, room = float(scores[ACCURACY].mean()) - ends[0], ends[1] - ends[0]
     return Score(
-        cell=effects.label(point, record.grid),
+        cell=cell,
         heads=point[0],
         fraction=point[1],
         encoders=len(results),
         n=len(scores[ACCURACY]),
         metrics={name: _spread(values) for name, values in scores.items() if len(values)},
         gain=gain,
-        share=gain / (ceiling.mean - floor) if ceiling and ceiling.mean > floor else math.nan,
+        share=gain / room if room > 0 else math.nan,
         confusion=np.concatenate(recall).mean(axis=0).tolist(),
         components=intervals.variance_components(curves),
         losses=_losses(results),

@@ -10,13 +10,16 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from study.analysis.claims import Verdict
+from study.analysis.learning_curves import KEYFRAME
 from study.analysis.metrics import Metric
+from study.config.baselines import BASELINES
 from study.config.heads import HEAD_SETS
 from study.report import rounding
 from study.report.document import Block, Inline, bold, code, italic, parse, plain, table
-from study.report.model import Report, Spread
+from study.report.model import Report, Score, Spread
 from study.report.rounding import LOSS, NOTHING, UNITS, interval, percent, show, thousands
 
+FURTHER_COLUMNS = 5  # metrics that a page has room for, each with its standard deviation
 ROUNDINGS = ("duration", "epochs", "fixed", "gigabytes", "interval", "kinds", "percent", "points", "probability")
 
 
@@ -66,10 +69,18 @@ def _lists(report: Report) -> dict[str, Any]:
         "outcomes": "; ".join(f"{len(names)} {word} ({', '.join(names)})" for word, names in report.outcomes.items()),
         "ends_over": " or ".join(dict.fromkeys(over)),
         "ends": "; ".join(f"{row.cell} {percent(row.accuracy.mean)} % ({percent(row.accuracy.sd, 2)})" for row in ends),
+        "keyframes": "; ".join(
+            f"{row.cell} {percent(row.metrics[KEYFRAME].mean)} %" for row in ends if KEYFRAME in row.metrics
+        ),
+        "about": {name: baseline.about for name, baseline in BASELINES.items()},
         "drives": counts(row.episodes.n for row in report.accuracy_contrasts if row.episodes),
         "unseen": "; ".join(unseen),
         "main": {"about": _about(main), "table": main_scores(report, main)},
-        "further": {"about": _about(further), "table": further_scores(report, further)},
+        "further": [
+            {"about": _about(part), "table": further_scores(report, part)}
+            for start in range(0, len(further), FURTHER_COLUMNS)
+            for part in (further[start : start + FURTHER_COLUMNS],)
+        ],
         "setting": {f"{row.group}.{row.name}": row.value for row in report.settings},
         "labels": [
             (name, "chosen" if kind == "all" else kind, labels)
@@ -90,23 +101,26 @@ def title(metric: Metric) -> Inline:
 
 
 def main_scores(report: Report, metrics: Sequence[Metric]) -> Inline:
-    """Return the table of the metrics that have a floor, with the ceiling's and the floor's rows."""
+    """Return the table of the metrics that have a floor: head sets, baselines, and the floor's row."""
     header, floor = ["Cell", "n"], [italic("floor"), ""]
-    top = [italic("ceiling (true state)"), report.ceiling.n if report.ceiling else NOTHING]
-    rows: list[list[object]] = [[row.cell, row.n] for row in report.scores]
+    scores = (*report.scores, *report.baselines)
+    rows: list[list[object]] = [[_name(report, row), row.n] for row in scores]
     for index, metric in enumerate(metrics):
         header += [title(metric), "sd", "interval"]
         floor += [show(metric, report.floor.get(metric.name)), "", ""]
-        top += _spread_cells(metric, None if index else report.ceiling)
-        for row, score in zip(rows, report.scores, strict=True):
+        for row, score in zip(rows, scores, strict=True):
             row.extend(_spread_cells(metric, score.metrics.get(metric.name)))
-        if not index:  # accuracy: of its gain above the floor, how much it is and could be
+        if not index:  # accuracy: of its gain above the best trivial baseline, how much it is and could be
             header += ["IQM", "gain", "share"]
-            floor += ["", percent(0), percent(0, 0)]
-            top += ["", "", percent(1, 0)]
-            for row, score in zip(rows, report.scores, strict=True):
+            floor += ["", "", ""]
+            for row, score in zip(rows, scores, strict=True):
                 row.extend([percent(score.accuracy.iqm, 2), percent(score.gain), percent(score.share, 0)])
-    return table(header, [*rows, *[top] * (report.ceiling is not None), floor])
+    return table(header, [*rows, floor])
+
+
+def _name(report: Report, score: Score) -> object:
+    """Return the name of a table's row; baselines are told from head sets by italics."""
+    return italic(score.cell) if score in report.baselines else score.cell
 
 
 def _spread_cells(metric: Metric, spread: Spread | None) -> list[str]:
@@ -117,10 +131,10 @@ def _spread_cells(metric: Metric, spread: Spread | None) -> list[str]:
 
 
 def further_scores(report: Report, metrics: Sequence[Metric]) -> Inline:
-    """Return the table of the other metrics."""
+    """Return the table of some other metrics."""
     rows = [
-        [score.cell, score.n, *(_mean_and_sd(metric, score.metrics.get(metric.name)) for metric in metrics)]
-        for score in report.scores
+        [_name(report, score), score.n, *(_mean_and_sd(metric, score.metrics.get(metric.name)) for metric in metrics)]
+        for score in (*report.scores, *report.baselines)
     ]
     return table(["Cell", "n", *map(title, metrics)], rows)
 

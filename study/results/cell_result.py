@@ -11,13 +11,12 @@ import numpy as np
 import pandas as pd
 
 from study.config.grid import Cell
-from study.config.heads import CEILING
 from study.config.keys import cell_key
 from study.config.settings import StudySettings
 from study.errors import BadInputError
 from study.products import Arrays, read_product, write_product
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2  # 2: keyframes and weights beside the predictions
 CURVE_COLUMNS = ("policy_seed", "stage", "split", "epoch", "metric", "value")
 TABLE_COLUMNS = ("sweep", "heads", "fraction", "encoder_seed", *CURVE_COLUMNS)
 NO_SEED = -1  # policy_seed of rows that belong to the encoder
@@ -29,20 +28,21 @@ HEAD = "cell.json"
 class CellResult:
     """A trained encoder and the policies on it. S policy seeds, N test frames of the policy set, K sample frames.
 
-    The ceiling, policies on the true state, has neither an encoder nor samples nor curves of an encoder.
+    A baseline has neither an encoder nor samples nor curves of an encoder.
 
     `curves`: one row per measured point, columns CURVE_COLUMNS; stage "encoder" (metrics loss, loss_rec, loss_pred,
-    loss_plan, loss_kl; policy_seed is NO_SEED) or "policy" (steering_loss, acceleration_accuracy, balanced_accuracy,
-    cross_entropy); split "train" or "test"; epoch counts from 1.
+    loss_plan, loss_kl; policy_seed is NO_SEED) or "policy" (the metrics of
+    `study.policy.metrics`); split "train" or "test"; epoch counts from 1.
     `encoder`, `policies`: weights by name; those of the policies have a leading axis S, beside `z_mean`, `z_std` [64].
     `samples`: test frames of the encoder set: `input` [K, 64, 64, 3] uint8, and for each head `<head>_output` uint8
     ([K, 64, 64, 3] for rec, [K, 64, 64] else, 255 is one) and `<head>_target` for pred and plan.
     `predictions`: `acceleration` [S, N] uint8 class and `steering` [S, N] float32 after the last epoch, with
     `acceleration_label`, `steering_label`, `episode`, `speed` [m/s], `light` (0 none or green, 1 yellow, 2 red),
-    `lead_gap` [m] (NaN: free) [N], and `z` [N, 64] float32 (not normalised).
-    `facts`: floor (majority accuracy on test), heads (entropy and constant of each, see
-    `study.encoder.bounds`), frames (counts), seconds per stage, peak_bytes, device, precision, threads, versions:
-    whatever a reader needs to judge the numbers.
+    `lead_gap` [m] (NaN: free), `keyframe`, `weight` [N] (see `study.data.selection.LABELS`), and `z` [N, 64] float32
+    (not normalised).
+    `facts`: floor (majority accuracy on test), heads (entropy and constant of each, see `study.encoder.bounds`), frames
+    (counts), seconds per stage, peak_bytes, device, precision, threads, versions: whatever a reader needs to judge the
+    numbers.
     """
 
     cell: Cell
@@ -116,7 +116,7 @@ def _check(result: CellResult) -> None:
     if not np.isfinite(result.curves["value"].to_numpy(np.float64)).all():
         raise ValueError("its curves hold values that are not finite")
     for stage, policy_seeds, epochs in (
-        ("encoder", [NO_SEED] * (result.cell.heads != CEILING), settings.encoder.epochs),
+        ("encoder", [NO_SEED] * (result.cell.baseline is None), settings.encoder.epochs),
         ("policy", list(range(seeds)), settings.policy.epochs),
     ):
         rows = result.curves[result.curves["stage"] == stage]

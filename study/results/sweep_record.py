@@ -8,8 +8,8 @@ from typing import Any
 
 import pandas as pd
 
+from study.config.baselines import BASELINES
 from study.config.grid import Cell, Grid
-from study.config.heads import CEILING
 from study.config.settings import StudySettings
 from study.results.cell_result import TABLE_COLUMNS, CellResult
 
@@ -37,19 +37,13 @@ class SweepRecord:
         """Return whether every planned cell is finished."""
         return set(self.planned) <= set(self.results)
 
-    @property
-    def ceiling(self) -> CellResult | None:
-        """Return the result of policies on the true state, or None where that cell is not finished."""
-        key = next((key for key, cell in self.planned.items() if cell.heads == CEILING), "")
-        return self.results.get(key)
-
-    def table(self, *, ceiling: bool = False) -> pd.DataFrame:
+    def table(self, *, baselines: bool = False) -> pd.DataFrame:
         """Return the tidy table: one row per measured point, columns TABLE_COLUMNS, in the order of the plan.
 
-        The ceiling is no head set under study: it is in the table only when asked for.
+        A baseline is no head set under study: it is in the table only when asked for.
         """
         tidy = self._tidy
-        return tidy if ceiling else tidy[tidy["heads"] != CEILING].reset_index(drop=True)
+        return tidy if baselines else tidy[~tidy["heads"].isin(BASELINES)].reset_index(drop=True)
 
     @cached_property
     def _tidy(self) -> pd.DataFrame:

@@ -40,7 +40,7 @@ class World:
     policy_sd: float = 0.002
     epoch_sd: float = 0.0015
     epochs: int = 100
-    ceiling: float = 0.97  # accuracy of policies on the true state
+    baselines: dict[str, float] = field(default_factory=lambda: {"trail-pca": 0.8, "supervised": 0.9, "state": 0.97})
 
 
 HEADS_GRID = Grid(
@@ -141,7 +141,9 @@ def policy_curves(cell, world, seeds, rng):
     """Return accuracy and steering loss by epoch on both splits, [S, E] each."""
     halvings = -np.log2(cell.fraction) * (1.0 if cell.heads == "rec" else 0.5)
     final = (
-        world.accuracy.get(cell.heads, world.ceiling) - world.by_fraction * halvings + rng.normal(0, world.encoder_sd)
+        world.accuracy.get(cell.heads, world.baselines.get(cell.heads, 0.78))
+        - world.by_fraction * halvings
+        + rng.normal(0, world.encoder_sd)
     )
     epoch = np.arange(1, world.epochs + 1)
     shape = np.exp(-epoch / (world.time.get(cell.heads, 5.0) * (1 + world.slower * halvings)))
@@ -161,6 +163,15 @@ def policy_curves(cell, world, seeds, rng):
         ("train", "steering_loss"): loss * 0.9,
         ("test", "cross_entropy"): 1.1 - 0.8 * test,
         ("train", "cross_entropy"): 1.05 - 0.8 * test,
+        **{
+            (split, metric): values
+            for split, shift in (("test", 0.0), ("train", 0.03))
+            for metric, values in {
+                "keyframe_accuracy": 2 * test - 1 + shift,
+                "natural_accuracy": test + 0.02 + shift,
+                "natural_steering_loss": loss * 0.8,
+            }.items()
+        },
     }
 
 
@@ -199,6 +210,8 @@ def simulate_cell(cell, key, settings, world, seeds, rng, labels):
             "speed": (10 * rng.random(FRAMES) * (acceleration > 0)).astype(np.float32),
             "light": np.where(acceleration == 0, 2, 0).astype(np.uint8),
             "lead_gap": np.where(rng.random(FRAMES) < 0.5, np.nan, 20.0).astype(np.float32),
+            "keyframe": rng.random(FRAMES) < 0.3,
+            "weight": rng.uniform(0.5, 1.5, FRAMES).astype(np.float32),
             "z": (rng.normal(size=(FRAMES, 64)) + np.eye(64)[0] * 2 * acceleration[:, None]).astype(np.float32),
         },
         facts={

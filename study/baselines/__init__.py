@@ -1,0 +1,1 @@
+"""Baselines: what policies are given in the place of a trained latent."""

@@ -1,0 +1,99 @@
+"""A network of the encoder's shape and the policies', trained end to end on the commands of the policy set.
+
+It shows what the images alone let a network of this size learn from the policy set, without any pretraining. Policies
+are then trained on its frozen latent, as on every other.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import lightning
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from study.baselines.inputs import BaselineInputs, Z
+from study.compute.device import check_device, keep_memory
+from study.compute.trainer import trainer
+from study.config.paper import ACCELERATION_HIDDEN, ACCELERATIONS, DROPOUT, LATENT, STEERING_HIDDEN
+from study.data.frames import Frames
+from study.encoder.inputs import to_float
+from study.encoder.latents import encode
+from study.encoder.networks import initialise, seeded_generator, untrained_encoder
+from study.errors import TrainingDivergedError
+from study.randomness import rng
+from study.stages import SUPERVISED_EPOCHS
+
+
+def supervised_latents(inputs: BaselineInputs) -> Z:
+    """Return the latents of the trained network. Raises TrainingDivergedError for a loss that is not finite."""
+    device, frames, settings = check_device(inputs.device), inputs.store.policy, inputs.settings.encoder
+    if device.type == "cpu":
+        keep_memory()
+    network = _Supervised(frames, settings.lr, inputs)
+    train = frames.indices("train")
+    batch = min(settings.batch, len(train))
+    with trainer(device, SUPERVISED_EPOCHS, f"batch {batch}", "lower --encoder.batch") as lightning_trainer:
+        network.batches = math.ceil(len(train) / batch)
+        lightning_trainer.fit(network, train_dataloaders=range(network.batches))
+    weights = {name: value.numpy(force=True) for name, value in network.encoder.state_dict().items()}
+    return encode(weights, frames.images, np.arange(len(frames)), device=inputs.device)
+
+
+def _head(widths: tuple[int, ...]) -> nn.Sequential:
+    """Return fully connected layers with ReLU and dropout after all but the last (Sec. IV-C)."""
+    layers: list[nn.Module] = []
+    for before, after in itertools.pairwise(widths):
+        layers += [nn.Linear(before, after), nn.ReLU(), nn.Dropout(DROPOUT)]
+    return nn.Sequential(*layers[:-2])
+
+
+class _Supervised(lightning.LightningModule):
+    """The encoder, and on its latent both policy networks, with the policies' loss."""
+
+    def __init__(self, frames: Frames, lr: float, inputs: BaselineInputs) -> None:
+        super().__init__()
+        self.automatic_optimization = False
+        self.lr, self.inputs, self.batches = lr, inputs, 0
+        self.frames, self.train_rows = frames, frames.indices("train")
+        labels = frames.labels
+        self.commands = (
+            torch.tensor(labels["steering"].to_numpy(np.float32)),
+            torch.tensor(labels["acceleration"].to_numpy(np.int64)),
+        )
+        self.encoder = untrained_encoder(inputs.seed)
+        self.heads = nn.ModuleDict(
+            {
+                "steering": _head((LATENT, *STEERING_HIDDEN, 1)),
+                "acceleration": _head((LATENT, *ACCELERATION_HIDDEN, len(ACCELERATIONS))),
+            }
+        )
+        initialise(self.heads, seeded_generator(inputs.seed, "supervised heads"))
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        return torch.optim.Adam(self.parameters(), lr=self.lr, fused=True)
+
+    def on_train_epoch_start(self) -> None:
+        generator = rng(self.inputs.seed, f"supervised epoch {self.current_epoch}")
+        self.parts = np.array_split(generator.permutation(self.train_rows), self.batches)
+        torch.manual_seed(int(generator.integers(2**63)))  # of dropout, which takes no generator
+
+    def training_step(self, batch: int) -> None:
+        rows = np.sort(self.parts[batch])
+        steering, acceleration = (values[rows].to(self.device) for values in self.commands)
+        z = self.encoder(to_float(torch.from_numpy(self.frames.images[rows]).to(self.device)))
+        loss: Tensor = functional.smooth_l1_loss(self.heads["steering"](z).squeeze(1), steering)
+        loss = loss + functional.cross_entropy(self.heads["acceleration"](z), acceleration)
+        optimizer = self.optimizers(use_pl_optimizer=False)
+        assert isinstance(optimizer, torch.optim.Optimizer)
+        optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        optimizer.step()
+        self.inputs.progress(self.current_epoch * self.batches + batch + 1, SUPERVISED_EPOCHS * self.batches)
+        if not math.isfinite(value := float(loss.detach())):
+            raise TrainingDivergedError(
+                f"baseline supervised: the loss is {value} in epoch {self.current_epoch + 1}; lower --encoder.lr"
+            )

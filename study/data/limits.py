@@ -1,0 +1,43 @@
+"""The speed limit that holds where a vehicle is."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.neighbors import KDTree
+
+from study.data.birdview import Moments
+from study.episode.schema import Episode, Lane
+
+SPACING = 2.0  # between points of a lane's centre line [m]
+TURNED = 10.0  # a lane in the opposite direction counts as twice this much farther away [m]
+
+Floats = NDArray[np.float64]
+
+
+def speed_limits(episode: Episode, moments: Moments) -> NDArray[np.float32]:
+    """Return the limit [M] [m/s] of the lane nearest to each vehicle in place and direction, NaN if unknown."""
+    limits = np.array([np.nan if lane.speed_limit is None else lane.speed_limit for lane in episode.lanes])
+    if len(np.unique(limits)) < 2:
+        return np.full(len(moments), limits[0] if len(limits) else np.nan, np.float32)
+    lines = [_line(lane) for lane in episode.lanes]
+    owner = np.repeat(np.arange(len(lines)), [len(line) for line in lines])
+    at = tuple(moments.T)
+    heading = episode.heading[at].astype(np.float64)
+    seen = np.stack([episode.x[at], episode.y[at], TURNED * np.cos(heading), TURNED * np.sin(heading)], axis=1)
+    nearest = KDTree(np.concatenate(lines)).query(seen, return_distance=False)[:, 0]
+    here: NDArray[np.float32] = limits[owner[nearest]].astype(np.float32)
+    return here
+
+
+def _line(lane: Lane) -> Floats:
+    """Return points of a lane's centre line and its direction there [P, 4] [m]."""
+    centre = np.asarray(lane.centre, np.float64)
+    steps = np.diff(centre, axis=0)
+    lengths = np.hypot(*steps.T)
+    along = np.concatenate([[0.0], np.cumsum(lengths)])
+    s = np.linspace(0, along[-1], max(2, int(np.ceil(along[-1] / SPACING)) + 1))
+    part = np.clip(np.searchsorted(along, s, side="right") - 1, 0, len(steps) - 1)
+    direction = steps[part] / np.maximum(lengths[part], 1e-9)[:, None]
+    places = np.stack([np.interp(s, along, centre[:, axis]) for axis in (0, 1)], axis=1)
+    return np.concatenate([places, TURNED * direction], axis=1)
