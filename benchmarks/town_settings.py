@@ -42,10 +42,10 @@ from study.episode.files import read_episode
 from study.policy.training import train_policies
 
 RESULTS = Path(__file__).with_name("results") / "town_settings"
-POLICY_SEEDS = 3
+POLICY_SEEDS = 2
 SIZE = {
-    "recording": {"encoder_episodes": 16, "policy_episodes": 64},
-    "frames": {"encoder": 4000, "policy": 8000},
+    "recording": {"encoder_episodes": 8, "policy_episodes": 40},
+    "frames": {"encoder": 2500, "policy": 5000},
 }
 OLD = {"dynamics": {"steering_unit": 2.4}, "town": {"per_drive": True, "brake_hold": 0.5}}
 LIMITS = [30.0, 40.0, 50.0]
