@@ -424,7 +424,7 @@ def test_policies_that_are_given_speeds_read_them_and_start_from_their_own_seed(
     sets = []
     for frames in (TRAIN, TEST):
         z, speeds = rng.normal(size=(frames, 64)), rng.normal(5, 2, size=(frames, SPEEDS))
-        labels = pd.DataFrame({"steering": np.zeros(frames), "acceleration": np.digitize(speeds[:, 0], [4, 6])})
+        labels = drive(frames, 1)[1].assign(steering=0.0, acceleration=np.digitize(speeds[:, 0], [4, 6]))
         sets.append((np.column_stack([z, speeds]).astype(np.float32), labels))
     (train_x, train_labels), (test_x, test_labels) = sets
     given = train_policies(train_x, test_x, train_labels, test_labels, [0, 1], settings)
