@@ -55,6 +55,7 @@ def make_result(cell, key, seed=0):
         facts={
             "floor": 0.34,
             "frames": {"policy_test": 7},
+            "heads": {"rec": {"entropy": 0.2, "constant": 0.33}},
             "seconds": {"encoder": 1.5},
             "device": "cpu",
             "provenance": {"commit": "c" * 40, "dirty": False, "diff": "", "packages": {}},
@@ -226,6 +227,7 @@ def test_a_list_of_runs_reads_well(tracker):
     assert shown.items() <= run.data.params.items()
     assert run.data.metrics["floor"] == 0.34
     assert run.data.metrics["seconds/encoder"] == 1.5
+    assert (run.data.metrics["heads/rec/entropy"], run.data.metrics["heads/rec/constant"]) == (0.2, 0.33)
     assert run.data.tags["mlflow.source.git.commit"] == "c" * 40
     assert run.data.tags["device"] == "cpu"
     assert run.data.tags["mlflow.runColor"] == "#D55E00"
