@@ -44,11 +44,11 @@ from study.policy.training import train_policies
 RESULTS = Path(__file__).with_name("results") / "town_settings"
 POLICY_SEEDS = 2
 SIZE = {
-    "recording": {"encoder_episodes": 8, "policy_episodes": 40},
-    "frames": {"encoder": 2500, "policy": 5000},
+    "recording": {"encoder_episodes": 6, "policy_episodes": 32},
+    "frames": {"encoder": 2000, "policy": 4000},
 }
 OLD = {"dynamics": {"steering_unit": 2.4}, "town": {"per_drive": True, "brake_hold": 0.5}}
-LIMITS = [30.0, 40.0, 50.0]
+LIMITS = [20.0, 30.0, 40.0]  # above 40 km/h, braking for a light begins before the light is in the picture
 
 
 def _setting(lag: float, hold: float, *, wheel: float = 0.0, limits: bool = False, per_drive: bool = False) -> Any:
@@ -66,7 +66,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "lag-0.4-wheel": _setting(0.4, 0, wheel=0.1),
     "lag-0.4-hold": _setting(0.4, 0.5),
     "limits": _setting(0, 0, limits=True),
-    "limits-lag-0.2": _setting(0.2, 0, limits=True),
+    "limits-hold": _setting(0, 0.5, limits=True),
     "limits-lag-0.4": _setting(0.4, 0, limits=True),
     "limits-lag-0.4-wheel": _setting(0.4, 0, wheel=0.1, limits=True),
     "limits-lag-0.4-hold": _setting(0.4, 0.5, limits=True),
