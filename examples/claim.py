@@ -5,7 +5,8 @@ python -m examples.claim heads --profile smoke
 
 from __future__ import annotations
 
-from study.analysis.claims import CLAIMS, REACHES, Claim, at_top
+from study.analysis.claims import CLAIMS, Claim, at_top
+from study.analysis.rules import REACHES
 from study.console.options import run
 from study.report.__main__ import main
 

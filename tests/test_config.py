@@ -183,12 +183,23 @@ def test_a_rule_is_one_number_or_one_for_each_profile(tmp_path):
     rules_by_profile = {
         name: load_grid("own", folder=tmp_path, profile=name).rules for name in ("smoke", "laptop", "mine")
     }
-    assert {name: rules.encoder_allowance for name, rules in rules_by_profile.items()} == {
+    assert {name: rules.allowance(["rec", "rec"]) for name, rules in rules_by_profile.items()} == {
         "smoke": 0.2,
         "laptop": 0.02,
         "mine": 0.2,  # not named: the largest
     }
     assert {rules.alpha for rules in rules_by_profile.values()} == {0.1}
+
+
+def test_an_allowance_is_one_number_or_one_for_each_head_set(tmp_path):
+    file = tmp_path / "own.yaml"
+    for text, expected in (
+        ("{rec: 0.01, full: 0.02}", {"rec": 0.01, "full": 0.02}),
+        ("{laptop: {rec: 0.01, full: 0.02}, smoke: {rec: 0.3}}", {"rec": 0.01, "full": 0.02}),
+        ("{smoke: {rec: 0.3}, paper: {rec: 0.01, full: 0.4}}", {"rec": 0.3, "full": 0.4}),  # not named: the largest
+    ):
+        file.write_text(f"title: T\nheads: [rec]\nrules: {{encoder_allowance: {text}}}\n")
+        assert load_grid("own", folder=tmp_path).rules.encoder_allowance == expected
 
 
 @pytest.mark.parametrize("allowance", ["{}", "{smoke: much}", "{smoke: -1, laptop: -2}", "many"])

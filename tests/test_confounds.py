@@ -7,10 +7,13 @@ import pytest
 
 from study.analysis import comparisons
 from study.analysis.confounds import CONFOUNDS, concerned, contrasts, varied
+from study.analysis.effects import planned
 from study.config.files import load_grid
 from study.config.settings import StudySettings
 from study.report.build import build_report
+from study.report.markdown import markdown
 from study.report.summary import summarise
+from study.report.text import document
 from study.sweep.plan import make_plan
 from tests.support.synthetic_records import DATASIZE_GRID, HEADS_GRID, World, simulate
 
@@ -58,34 +61,53 @@ def test_the_command_line_goes_before_a_sweeps_own_settings():
 
 def test_a_difference_that_a_setting_makes_is_seen_and_one_that_it_does_not_is_not():
     record = simulate(HEADS_GRID, FAST)
-    lifted = replace(FAST, accuracy=FAST.accuracy | {"full": FAST.accuracy["full"] + 0.05})
+    lifted = replace(FAST, accuracy=FAST.accuracy | {"full": FAST.accuracy["full"] - 0.10})
     for world, states in ((FAST, {"open"}), (lifted, {"open", "moved"})):
         other = simulate(HEADS_GRID, world, seed=1)
         rows = contrasts(record, other, SPLIT)
-        assert [row.first[0] for row in rows] == ["rec+pred", "rec+plan", "full"]
+        assert [(row.first, row.second) for row in rows] == planned(HEADS_GRID)  # all pairs of head sets
         assert {row.state for row in rows} == states
-        assert [row.first[0] for row in rows if row.state == "moved"] == ["full"] * (len(states) - 1)
+        assert all("full" in (row.first[0], row.second[0]) for row in rows if row.state == "moved")
+        assert all((row.state == "moved") == (row.bounds[0] > 0 or row.bounds[1] < 0) for row in rows)
 
 
-def test_differences_are_to_the_baseline_whichever_it_is():
-    record = simulate(HEADS_GRID.model_copy(update={"baseline": "full"}), FAST)
-    rows = contrasts(record, record, SPLIT)
-    assert [(row.first[0], row.second[0]) for row in rows] == [
-        (name, "full") for name in ("rec", "rec+pred", "rec+plan")
-    ]
-    assert all(row.here.value < 0 for row in rows)
-
-
-def test_what_matters_below_all_the_data_is_shown_there_only():
-    record = simulate(DATASIZE_GRID, FAST)
+def test_what_matters_below_all_the_data_is_shown_there_and_across_fractions():
     budget = next(confound for confound in CONFOUNDS if confound.setting == "encoder.budget")
-    assert {row.first[1] for row in contrasts(record, record, budget)} == {0.5, 0.25, 0.125, 0.0625}
+    rows = contrasts(simulate(DATASIZE_GRID, FAST), simulate(DATASIZE_GRID, FAST, seed=1), budget)
+    assert {row.first[1] for row in rows} == {0.5, 0.25, 0.125, 0.0625}
+    pairs = {(row.first, row.second) for row in rows}
+    assert len(pairs) == len(rows) == 12
+    for fraction in (0.5, 0.25, 0.125, 0.0625):
+        assert (("full", fraction), ("rec", fraction)) in pairs
+        assert {(("full", fraction), ("rec", 1.0)), (("rec", fraction), ("rec", 1.0))} <= pairs
+
+
+def test_a_cell_that_is_the_same_in_both_sweeps_is_no_part_of_the_change():
+    record, other = (simulate(DATASIZE_GRID, FAST, seed=seed) for seed in (0, 1))
+    alike = {key: result for key, result in record.results.items() if result.cell.fraction == 1}
+    budget = next(confound for confound in CONFOUNDS if confound.setting == "encoder.budget")
+    apart, shared = (
+        {row.name: row for row in contrasts(record, each, budget)}
+        for each in (other, replace(other, results=other.results | alike))
+    )
+    name = next(name for name, row in shared.items() if row.second == ("rec", 1.0))
+    width = [row.bounds[1] - row.bounds[0] for row in (apart[name], shared[name])]
+    assert width[1] < width[0]  # two encoders are concerned, not four
+    assert contrasts(record, record, budget) == []
 
 
 def test_welchs_interval_covers_a_true_difference():
     rng = np.random.default_rng(0)
-    intervals = [comparisons.welch(rng.normal(0.3, 1, 15), rng.normal(0, 2, 8)) for _ in range(800)]
+    intervals = [comparisons.apart(rng.normal(0.3, 1, 15), rng.normal(0, 2, 8)) for _ in range(800)]
     assert 0.93 < np.mean([each.low < 0.3 < each.high for each in intervals]) < 0.97
+
+
+def test_nothing_is_cleared_for_want_of_proof(tmp_path):
+    record = with_variant(simulate(PAIR, FAST), grid=PAIR, world=FAST)
+    build_report(record, tmp_path)
+    text = markdown(document(summarise(record)))
+    assert "No change is shown, and none is excluded" in text
+    assert "nothing here makes" not in text
 
 
 def test_a_sweep_without_variants_lists_how_to_run_each(tmp_path):

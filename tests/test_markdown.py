@@ -73,7 +73,7 @@ def test_confounds_that_were_run_are_shown_under_both_values(report):
     own = summarise(replace(record, variants={"frames.split": other}))
     text = part(written(own), "`frames.split`: episode here, frame in `heads`")
     (row,) = [row for row in own.confounds if row.contrasts]
-    assert len(row.contrasts) == 3
+    assert len(row.contrasts) == 6
     for contrast in row.contrasts:
         line = cells(text, contrast.name)
         assert line[1:3] == ["15", points(contrast.here.value)]

@@ -1,45 +1,54 @@
-"""The paper's claims, and the rule by which each is reproduced, not reproduced or inconclusive.
+"""The paper's claims, and a verdict on each by its rule.
 
-To add a claim, add its record to `CLAIMS`, at the end of this file. The rules' numbers come from the sweep file
-(`study.config.grid.Rules`), so they are fixed before the run. A claim rests on one or more findings, each of which
-holds, fails or stays open: if all hold, the claim is reproduced; if one fails, it is not reproduced; else it is
-inconclusive. The intervals that decide are simultaneous, at 1 - alpha over the number of a claim's pairs. In design A,
-one encoder for each cell, an allowance for other encoders is added to their ends.
+To add a claim, add its record to `CLAIMS`, at the end of this file. A claim rests on one or more findings, each of
+which holds, fails or stays open (`study.analysis.rules`): if all hold, the claim is reproduced; if one fails, it is not
+reproduced; else it is inconclusive, or it cannot be tested at this size where the open findings have too little power.
+A claim about little data is not tested at this scale when an encoder has not learned (`study.analysis.learned`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-import pandas as pd
-
-from study.analysis import comparisons, convergence, intervals, learning_curves, predictions
-from study.analysis.effects import Interval, Unit, difference_label, label, results_at
-from study.analysis.learning_curves import ACCURACY, STEERING, Panel, Point
-from study.config.grid import Grid, Rules
-from study.config.settings import Number
+from study.analysis import effects, learning_curves, predictions
+from study.analysis.effects import label, results_at
+from study.analysis.learned import unlearned
+from study.analysis.learning_curves import ACCURACY, KEYFRAME, STEERING, Point
+from study.analysis.rules import (
+    ABOVE,
+    GOOD_STEERING,
+    MORE_SPREAD,
+    REACH,
+    REACHES,
+    SAME_STEERING,
+    Evidence,
+    Finding,
+    Pair,
+    Rule,
+    State,
+)
+from study.config.grid import Grid
 from study.results.sweep_record import SweepRecord
 
-State = Literal["holds", "fails", "open"]
-Outcome = Literal["reproduced", "not reproduced", "inconclusive", "not tested"]
-OUTCOMES: tuple[Outcome, ...] = ("reproduced", "not reproduced", "inconclusive", "not tested")
-Pair = tuple[Point, Point]
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One number that a claim rests on: what it is, its 95 % interval, the bounds that decide, and what follows."""
-
-    what: str
-    unit: Unit
-    estimate: Interval
-    decides: tuple[Number, Number]
-    needs: str
-    state: State
-    p: Number = math.nan
+Outcome = Literal[
+    "reproduced",
+    "not reproduced",
+    "inconclusive",
+    "cannot be tested at this size",
+    "not tested at this scale",
+    "not tested",
+]
+OUTCOMES: tuple[Outcome, ...] = (
+    "reproduced",
+    "not reproduced",
+    "inconclusive",
+    "cannot be tested at this size",
+    "not tested at this scale",
+    "not tested",
+)
 
 
 @dataclass(frozen=True)
@@ -55,39 +64,10 @@ class Verdict:
     findings: tuple[Finding, ...] = ()
     missing: tuple[str, ...] = ()
 
-
-@dataclass(frozen=True)
-class Evidence:
-    """Curves of accuracy and steering loss by head set and fraction, which the rules look at.
-
-    `floor` is the steering loss of the best constant command.
-    """
-
-    grid: Grid
-    accuracy: Panel
-    steering: Panel
-    floor: float
-
     @property
-    def rules(self) -> Rules:
-        """Return the sweep file's rules."""
-        return self.grid.rules
-
-    def one_encoder(self, pair: Pair) -> bool:
-        """Return whether one of these cells has one encoder only."""
-        return learning_curves.design([self.accuracy[point] for point in pair]) == "A"
-
-    def allowance(self, pair: Pair) -> float:
-        """Return what is added to an interval's ends: 0 where both cells have several encoders."""
-        return self.rules.encoder_allowance if self.one_encoder(pair) else 0.0
-
-
-@dataclass(frozen=True)
-class Rule:
-    """A way to decide: its words, with the numbers of a sweep file, and a claim's finding on each pair of cells."""
-
-    words: Callable[[Rules], str]
-    find: Callable[[Evidence, Sequence[Pair]], list[Finding]]
+    def deciding(self) -> tuple[Finding, ...]:
+        """Return the findings that the verdict rests on, without those that are reported beside them."""
+        return tuple(finding for finding in self.findings if not finding.beside)
 
 
 @dataclass(frozen=True)
@@ -95,7 +75,8 @@ class Claim:
     """A claim of the paper.
 
     `section` of the paper; `needs`: the head sets without which a sweep cannot test it; `pairs`: which cells of a grid
-    it compares, none where the sweep lacks the data fractions; `rule` decides on each pair.
+    it compares, none where the sweep lacks the data fractions; `rule` decides on each pair; `learned`: whether it is
+    about what encoders have learned from less data, so that each of them must have learned.
     """
 
     name: str
@@ -104,37 +85,56 @@ class Claim:
     needs: tuple[str, ...]
     rule: Rule
     pairs: Callable[[Grid], list[Pair]]
+    learned: bool = False
 
 
 def judge(record: SweepRecord) -> list[Verdict]:
     """Return a verdict on each of `CLAIMS`, also on those that the sweep cannot test."""
     table, base = record.table(), ("rec", max(record.grid.fractions))
-    floor = steering_floor(record, base) if results_at(record, base) else math.nan
+    panels = {metric: learning_curves.panel(table, metric) for metric in (ACCURACY, STEERING, KEYFRAME)}
     return weigh(
-        Evidence(record.grid, learning_curves.panel(table, ACCURACY), learning_curves.panel(table, STEERING), floor)
+        Evidence(
+            record.grid,
+            panels,
+            steering_floor(record, base) if results_at(record, base) else math.nan,
+            {metric: effects.drive_scores(record, metric, panel) for metric, panel in panels.items()},
+            unlearned(record, panels[ACCURACY]),
+        )
     )
 
 
 def weigh(evidence: Evidence) -> list[Verdict]:
-    """Return a verdict on each of `CLAIMS` from the curves alone."""
-    return [_verdict(claim, evidence) for claim in CLAIMS.values()]
+    """Return a verdict on each of `CLAIMS` from curves and scores by drive alone."""
+    return [verdict(claim, evidence) for claim in CLAIMS.values()]
 
 
-def _verdict(claim: Claim, evidence: Evidence) -> Verdict:
+def verdict(claim: Claim, evidence: Evidence) -> Verdict:
+    """Return the verdict on one claim."""
     record = claim.name, claim.section, claim.text, claim.rule.words(evidence.rules)
     untestable, missing = _why_not(claim, evidence)
     if untestable:
         return Verdict(*record, "not tested", untestable, missing=missing)
-    findings = tuple(claim.rule.find(evidence, claim.pairs(evidence.grid)))
-    states = {finding.state for finding in findings}
+    pairs = claim.pairs(evidence.grid)
+    doubts = [evidence.doubts[point] for point in _points(pairs) if point in evidence.doubts] * claim.learned
+    if doubts:
+        return Verdict(*record, "not tested at this scale", f"Has every encoder learned? {'; '.join(doubts)}.")
+    findings = tuple(claim.rule.find(evidence, pairs))
+    deciding = [finding for finding in findings if not finding.beside]
+    states = {finding.state for finding in deciding}
     state: State = "fails" if "fails" in states else "open" if "open" in states else "holds"
     outcome, one, several = _OUTCOME[state]
-    concerned = [finding.what for finding in findings if finding.state == state]
+    concerned = [finding for finding in deciding if finding.state == state]
     if len(concerned) == 1:
-        reason = f"{concerned[0]}: {one}."
+        reason = f"{concerned[0].what}: {one}."
     else:
-        subject = f"All {len(findings)} findings" if len(concerned) == len(findings) else ", ".join(concerned)
-        reason = f"{subject} {several}."
+        names = ", ".join(finding.what for finding in concerned)
+        reason = f"{f'All {len(deciding)} findings' if len(concerned) == len(deciding) else names} {several}."
+    power = min(finding.power for finding in concerned)
+    if state == "open" and power < evidence.rules.least_power:
+        outcome = "cannot be tested at this size"
+        reason += (
+            f" {claim.rule.alternative(evidence.rules)} would be found with a power of {100 * power:.0f} % at most."
+        )
     return Verdict(*record, outcome, reason, findings)
 
 
@@ -143,6 +143,10 @@ _OUTCOME: dict[State, tuple[Outcome, str, str]] = {  # with the reason in words,
     "fails": ("not reproduced", "contradicts the claim", "contradict the claim"),
     "open": ("inconclusive", "leaves it open", "leave it open"),
 }
+
+
+def _points(pairs: list[Pair]) -> list[Point]:
+    return list(dict.fromkeys(point for pair in pairs for point in pair))
 
 
 def _why_not(claim: Claim, evidence: Evidence) -> tuple[str, tuple[str, ...]]:
@@ -154,13 +158,8 @@ def _why_not(claim: Claim, evidence: Evidence) -> tuple[str, tuple[str, ...]]:
     pairs = claim.pairs(grid)
     if not pairs:
         return f"This sweep lacks the data fractions; it has {', '.join(f'{100 * x:g} %' for x in grid.fractions)}.", ()
-    points = dict.fromkeys(point for pair in pairs for point in pair)
-    missing = tuple(label(point, grid) for point in points if point not in evidence.accuracy)
+    missing = tuple(label(point, grid) for point in _points(pairs) if point not in evidence.panels[ACCURACY])
     return (f"Not finished: {', '.join(missing)}." if missing else ""), missing
-
-
-def _state(*, holds: bool, fails: bool) -> State:
-    return "holds" if holds else "fails" if fails else "open"
 
 
 def steering_floor(record: SweepRecord, point: Point) -> float:
@@ -168,113 +167,9 @@ def steering_floor(record: SweepRecord, point: Point) -> float:
     return predictions.steering_floor(results_at(record, point)[0].predictions["steering_label"].astype("float64"))
 
 
-# --- rules ----------------------------------------------------------------------------------------------------------
-
-
-def _find_above(evidence: Evidence, pairs: Sequence[Pair]) -> list[Finding]:
-    """Return findings that the first's accuracy is above the second's."""
-    findings = []
-    for pair in pairs:
-        values = _differences(evidence.accuracy, pair)
-        units, allowance = learning_curves.by_encoder(values), evidence.allowance(pair)
-        low, high = intervals.t_limits(units, 1 - evidence.rules.alpha / len(pairs))
-        decides = low - allowance, high + allowance
-        state = _state(holds=decides[0] > 0, fails=decides[1] < evidence.rules.accuracy_margin)
-        what, p = difference_label(*pair, evidence.grid), comparisons.sign_flip(units)
-        findings.append(Finding(what, "points", intervals.mean_interval(values), decides, "above 0", state, p))
-    return findings
-
-
-def _find_same_steering(evidence: Evidence, pairs: Sequence[Pair]) -> list[Finding]:
-    """Return findings that steering losses differ by less than the margin (two one-sided tests)."""
-    rules, margin = evidence.rules, evidence.rules.steering_margin * evidence.floor
-    findings = []
-    for pair in pairs:
-        values = _differences(evidence.steering, pair)
-        units = learning_curves.by_encoder(values)
-        p, decides = comparisons.equivalence(units, margin), intervals.t_limits(units, 1 - rules.alpha / len(pairs))
-        state = _state(holds=p <= rules.alpha, fails=decides[0] > margin or decides[1] < -margin)
-        what, needs = difference_label(*pair, evidence.grid), f"within ±{1000 * margin:.2f}"
-        findings.append(Finding(what, "loss", intervals.mean_interval(values), decides, needs, state, p))
-    return findings
-
-
-def _differences(curves: Panel, pair: Pair) -> pd.Series:
-    """Return differences in final scores, paired by seed."""
-    return comparisons.paired(*(learning_curves.final(curves[point]) for point in pair))
-
-
-def _find_reach(evidence: Evidence, pairs: Sequence[Pair]) -> list[Finding]:
-    """Return findings that the first's mean curve reaches the second's final accuracy by the epoch of the text."""
-    findings = []
-    for pair in pairs:
-        (point, reference), (curves, base) = pair, (evidence.accuracy[point] for point in pair)
-        mean, goal = base.mean().to_numpy(), float(learning_curves.final(base).mean())
-        bound = (REACH.get(point[1], REACH[1.0]) + evidence.rules.reach_slack) * curves.shape[1]
-        epoch, allowance = convergence.epochs_to_reach(curves, base), evidence.allowance(pair)
-        # The baseline itself, even were its encoder better by the allowance, must be slower: else speed shows nothing.
-        slower = convergence.epochs_to_reach(base, base).low > epoch.high
-        distinct = epoch.high <= bound and slower and goal - mean[int(epoch.high) - 1] > allowance
-        behind = float(curves.mean().iloc[: max(int(bound), 1)].max()) + allowance < goal
-        what = f"{label(point, evidence.grid)} reaches {label(reference, evidence.grid)}'s final"
-        state = _state(holds=bool(distinct), fails=epoch.low > bound and behind)
-        findings.append(Finding(what, "epochs", epoch, (epoch.low, epoch.high), f"at most {bound:g}", state))
-    return findings
-
-
-def _find_more_spread(evidence: Evidence, pairs: Sequence[Pair]) -> list[Finding]:
-    """Return findings that the first's policies vary more than the second's, over the epochs of its transient."""
-    rules, findings = evidence.rules, []
-    for pair in pairs:
-        first, second = (evidence.accuracy[point] for point in pair)
-        epochs = convergence.transient(first)
-        simultaneous = convergence.spread_ratio(first, second, epochs, 1 - rules.alpha / len(pairs))
-        factor = rules.spread_factor if evidence.one_encoder(pair) else 1.0
-        low, high = simultaneous.low / factor, simultaneous.high * factor
-        what = f"variance of {pair[0][0]} over {pair[1][0]}, epochs 1 to {epochs}"
-        ratio, state = convergence.spread_ratio(first, second, epochs), _state(holds=low > 1, fails=high < 1)
-        findings.append(Finding(what, "ratio", ratio, (low, high), "above 1", state))
-    return findings
-
-
-ABOVE = Rule(
-    lambda rules: (
-        "Each difference's simultaneous interval lies above 0. It fails where the interval excludes a gain of "
-        f"{rules.accuracy_margin * 100:.1f} points. With one encoder for each cell the interval is widened by "
-        f"{rules.encoder_allowance * 100:.1f} points on either side."
-    ),
-    _find_above,
-)
-SAME_STEERING = Rule(
-    lambda rules: (
-        f"Equivalence: two one-sided t tests at {rules.alpha:g} against a margin of "
-        f"{rules.steering_margin * 100:g} % of the best constant command's loss. It fails where a "
-        "simultaneous interval lies outside the margin."
-    ),
-    _find_same_steering,
-)
-REACHES = Rule(
-    lambda rules: (
-        f"The upper end of the epoch's interval is at most the text's epoch and {rules.reach_slack * 100:g} % of all "
-        "epochs, and below the interval of the epoch at which rec itself reaches its final. With one encoder for each "
-        f"cell, rec must then still be {rules.encoder_allowance * 100:.1f} points "
-        "below its final, so that a copy of rec with a luckier encoder would not pass."
-    ),
-    _find_reach,
-)
-MORE_SPREAD = Rule(
-    lambda rules: (
-        "The ratio of the variances over policies, mean over the epochs in which rec makes 95 % of its rise, has a "
-        "simultaneous interval above 1. With one encoder for each cell the interval is widened by a factor of "
-        f"{rules.spread_factor:g} on either side."
-    ),
-    _find_more_spread,
-)
-
 # --- the claims -----------------------------------------------------------------------------------------------------
 
 PAPER_SETS = ("rec", "rec+pred", "rec+plan", "full")  # the paper's own: a further head set takes no claim away
-REACH = {1.0: 0.2, 0.25: 0.4, 0.0625: 0.6}  # fraction -> share of the epochs that the text names (Sec. V-A, V-B)
 
 
 def at_top(*names: tuple[str, str]) -> Callable[[Grid], list[Pair]]:
@@ -291,11 +186,19 @@ CLAIMS: dict[str, Claim] = {
     claim.name: claim
     for claim in (
         Claim(
+            "H0",
+            "abstract, V-A",
+            "Auxiliary heads improve acceleration: full is better than rec.",
+            ("rec", "full"),
+            ABOVE,
+            at_top(("full", "rec")),
+        ),
+        Claim(
             "H1",
             "V-A",
-            "Steering is good for all head sets: no meaningful difference in loss.",
+            "Steering is good for all head sets.",
             PAPER_SETS,
-            SAME_STEERING,
+            GOOD_STEERING,
             at_top(("rec+pred", "rec"), ("rec+plan", "rec"), ("full", "rec")),
         ),
         Claim(
@@ -344,6 +247,7 @@ CLAIMS: dict[str, Claim] = {
                     if heads in grid.heads and (heads, fraction) != base
                 ]
             ),
+            learned=True,
         ),
         Claim(
             "D2",
@@ -352,6 +256,7 @@ CLAIMS: dict[str, Claim] = {
             ("rec", "full"),
             ABOVE,
             by_fraction(lambda grid, _: [(("full", fraction), ("rec", fraction)) for fraction in grid.fractions]),
+            learned=True,
         ),
         Claim(
             "D3",
@@ -360,6 +265,7 @@ CLAIMS: dict[str, Claim] = {
             ("rec", "full"),
             ABOVE,
             by_fraction(lambda grid, base: [(("full", min(grid.fractions)), base)]),
+            learned=True,
         ),
         Claim(
             "D4",
@@ -370,6 +276,7 @@ CLAIMS: dict[str, Claim] = {
             by_fraction(
                 lambda grid, base: [(("full", fraction), base) for fraction in REACH if fraction in grid.fractions]
             ),
+            learned=True,
         ),
     )
 }

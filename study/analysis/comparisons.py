@@ -5,18 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-import numpy as np
 import pandas as pd
 from scipy import optimize, special
 from scipy import stats as scipy_stats
-from statsmodels.stats.weightstats import DescrStatsW
 
-from study.analysis.intervals import DRAWS, LEVEL, Estimate, t_interval
+from study.analysis.drives import DriveScores
+from study.analysis.intervals import LEVEL, Crossed, Estimate, Sample, crossed, satterthwaite
 from study.analysis.learning_curves import Array
-from study.randomness import rng
 
-WELCH = "Welch's t, two samples"
-EXACT = 20  # pairs up to which every flip of signs is counted
+PAIRED, WELCH = "t, paired by seed", "Welch's t, two samples"
 
 
 def paired(first: pd.Series, second: pd.Series) -> pd.Series:
@@ -24,37 +21,42 @@ def paired(first: pd.Series, second: pd.Series) -> pd.Series:
     return (first - second).dropna()
 
 
-def sign_flip(differences: Array) -> float:
-    """Return the two-sided p of the mean under all flips of signs: exact up to 20 pairs, beyond that by random flips.
+def difference(first: Sample, second: Sample) -> Crossed:
+    """Return the mean of two cells' scores, first minus second, over the seeds that both have and over test drives.
 
-    The smallest p that n pairs allow is 2 / 2^n. SciPy's `permutation_test` takes 0.2 s where this takes 1 ms.
+    The cells of a study are tested on the same drives, so differences are taken drive by drive.
     """
-    n = len(differences)
-    size = np.abs(differences).sum()
-    if n == 0 or size == 0:
-        return 1.0
-    observed = abs(differences.sum()) - 1e-12 * size
-    if n <= EXACT:
-        sums = np.zeros(1)
-        for value in differences:
-            sums = np.concatenate([sums + value, sums - value])
-        return float(np.mean(np.abs(sums) >= observed))
-    signs = rng(0, "sign flip").choice([-1.0, 1.0], size=(DRAWS, n))
-    return float((1 + np.sum(np.abs(signs @ differences) >= observed)) / (1 + DRAWS))
+    return crossed(paired_sample(first, second))
 
 
-def paired_t(differences: Sequence[float]) -> Estimate:
-    """Return the mean of paired differences with Student's interval."""
-    return t_interval(np.asarray(differences, np.float64), "t, paired by seed")
+def paired_sample(first: Sample, second: Sample) -> Sample:
+    """Return the differences of two cells' scores by seed and by drive."""
+    drives = _minus(first.drives, second.drives)
+    return Sample(paired(first.values, second.values), drives)
 
 
-def welch(first: Sequence[float] | Array, second: Sequence[float] | Array, kind: str = WELCH) -> Estimate:
-    """Return the difference of two samples' means, first minus second, with Welch's interval; n of the smaller."""
-    value, n = float(np.mean(first) - np.mean(second)), min(len(first), len(second))
+def _minus(first: DriveScores | None, second: DriveScores | None) -> DriveScores | None:
+    return first.minus(second) if first and second else None
+
+
+def apart(first: Array, second: Array, drives: Sequence[tuple[float, int]] = (), *, by_seed: bool = False) -> Estimate:
+    """Return the difference of two sweeps' means, first minus second; n of the smaller.
+
+    `by_seed`: both have the same seeds, in the same order, and are paired. `drives`: the standard error that test
+    drives add to each side, and their number; the sweeps' drives count as two samples, which is cautious where they are
+    one.
+    """
+    value, n = float(first.mean() - second.mean()), min(len(first), len(second))
     if n < 2:
         return Estimate(value, math.nan, math.nan, n, "no interval from one value")
-    low, high = scipy_stats.ttest_ind(first, second, equal_var=False).confidence_interval(LEVEL)
-    return Estimate(value, float(low), float(high), n, kind)
+    samples = [first - second] if by_seed else [first, second]
+    parts = [(float(part.var(ddof=1)) / len(part), len(part) - 1.0) for part in samples]
+    kind = PAIRED if by_seed else WELCH
+    if known := [(error**2, count - 1.0) for error, count in drives if count > 1]:
+        parts, kind = [*parts, *known], f"{kind}, and over test drives"
+    variance, freedom = satterthwaite(parts)
+    half = float(special.stdtrit(freedom, (1 + LEVEL) / 2)) * math.sqrt(variance)
+    return Estimate(value, value - half, value + half, n, kind)
 
 
 def improvement(first: Array, second: Array) -> float:
@@ -63,21 +65,20 @@ def improvement(first: Array, second: Array) -> float:
     return float(test.statistic) / (len(first) * len(second))
 
 
-def detectable(differences: Array) -> float:
-    """Return the smallest mean that a paired t test at 5 % finds with 80 % power on as many pairs; NaN below three."""
-    n = len(differences)
-    if n < 3:
+def detectable(mean: Crossed) -> float:
+    """Return the smallest true mean that a t test at 5 % finds with 80 % power at this variance; NaN without one."""
+    if math.isnan(mean.variance) or mean.freedom < 2:
         return math.nan
     # The square of t is F, whose noncentral form holds both tails; statsmodels' `solve_power` fails for many n.
-    bound = special.fdtri(1, n - 1, 0.95)
-    effect = optimize.brentq(lambda size: special.ncfdtr(1, n - 1, size, bound) - 0.2, 0.0, 400.0)
-    return float(math.sqrt(effect / n) * differences.std(ddof=1))
+    bound = special.fdtri(1, mean.freedom, 0.95)
+    effect = optimize.brentq(lambda size: special.ncfdtr(1, mean.freedom, size, bound) - 0.2, 0.0, 400.0)
+    return math.sqrt(effect) * mean.error
 
 
-def equivalence(differences: Array, margin: float) -> float:
+def equivalence(mean: Crossed, margin: float) -> float:
     """Return the p of two one-sided t tests: small when the mean lies within plus or minus the margin."""
-    if len(differences) < 2:
+    if math.isnan(mean.variance):
         return 1.0
-    if np.ptp(differences) == 0:
-        return 0.0 if abs(differences.mean()) < margin else 1.0
-    return float(DescrStatsW(differences).ttost_mean(-margin, margin)[0])
+    if not mean.variance:
+        return 0.0 if abs(mean.value) < margin else 1.0
+    return float(special.stdtr(mean.freedom, -(margin - abs(mean.value)) / mean.error))

@@ -6,13 +6,16 @@ have files of their own (`sweeps/heads-split-frame.yaml`), so that they never ta
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from study.analysis import comparisons, effects, intervals, learning_curves
 from study.analysis.effects import Interval
-from study.analysis.learning_curves import Point
-from study.config.settings import StudySettings
+from study.analysis.intervals import Sample
+from study.analysis.learning_curves import ACCURACY, Point
+from study.config.grid import Grid
+from study.config.settings import Number, StudySettings
 from study.results.sweep_record import SweepRecord
 
 
@@ -40,7 +43,8 @@ CONFOUNDS = (
         "heads-brake-hold-0",
         fractions=False,
         about="A brake, once on, is held for half a second, so that labels do not flip from frame to frame; 0 is "
-        "CARLA to the letter. A difference that is there with the hold alone is one of labels that can be learned.",
+        "CARLA to the letter. With the hold, half a second of labels follows from the last one: a head set that only "
+        "keeps the last command better gains from it.",
     ),
     Confound(
         "frames.balance",
@@ -93,7 +97,6 @@ CONFOUNDS = (
     ),
 )
 
-KIND = "Welch's t, over policy or encoder seeds"
 Movement = Literal["moved", "open"]
 
 
@@ -101,7 +104,8 @@ Movement = Literal["moved", "open"]
 class ContrastChange:
     """A difference in final accuracy under this sweep's setting and under the other, and what it changes by.
 
-    `state`: "moved" where the change's interval, widened by the allowance for other encoders, excludes 0.
+    `bounds`: the ends that decide, simultaneous over the confound's contrasts and widened by the allowance for other
+    encoders; `state`: "moved" where they exclude 0. "open" is no proof that nothing moves.
     """
 
     name: str
@@ -111,6 +115,7 @@ class ContrastChange:
     there: Interval
     change: Interval
     state: Movement
+    bounds: tuple[Number, Number] = (math.nan, math.nan)
 
 
 def concerned(record: SweepRecord) -> list[Confound]:
@@ -134,35 +139,50 @@ def value(settings: StudySettings, setting: str) -> str:
     return str(getattr(getattr(settings, group), name))
 
 
+def pairs(grid: Grid, confound: Confound) -> list[tuple[Point, Point]]:
+    """Return the contrasts that a confound may move: all pairs of head sets at each fraction, and across fractions.
+
+    Across fractions, every head set with part of the data is set against the baseline with all of it, as the claims
+    about data size do. What matters below all the data only leaves out the pairs at all the data.
+    """
+    top = max(grid.fractions)
+    plan = [pair for pair in effects.planned(grid) if not confound.fractions or pair[0][1] != top]
+    across = [(point, (grid.baseline, top)) for point in effects.points(grid) if point[1] != top]
+    return list(dict.fromkeys([*plan, *across] if grid.baseline in grid.heads else plan))
+
+
 def contrasts(record: SweepRecord, other: SweepRecord, confound: Confound) -> list[ContrastChange]:
-    """Return every head set against the baseline, at each fraction, that both sweeps have finished."""
-    panels = [learning_curves.panel(each.table(), learning_curves.ACCURACY) for each in (record, other)]
-    rows = []
-    for pair in effects.planned(record.grid):
-        second, first = sorted(pair, key=lambda point: point[0] != record.grid.baseline)
-        if second[0] != record.grid.baseline or first[1] != second[1] or (confound.fractions and first[1] == 1):
+    """Return how each contrast that both sweeps have finished changes with the setting.
+
+    A cell that is one and the same in both sweeps, as those at all the data may be, is no part of the change.
+    """
+    here, there = (_cells(each) for each in (record, other))
+    plan, rows = pairs(record.grid, confound), []
+    for pair in plan:
+        if not all(point in cells for cells in (here, there) for point in pair):
             continue
-        if not all(point in panel for panel in panels for point in (first, second)):
+        other_cells = [point for point in pair if not here[point].values.equals(there[point].values)]
+        parts = [comparisons.paired_sample(*(cells[point] for point in pair)) for cells in (here, there)]
+        if not other_cells or not all(len(part.values) for part in parts):
             continue
-        here, there = (
-            comparisons.paired(learning_curves.final(panel[first]), learning_curves.final(panel[second]))
-            for panel in panels
-        )
-        if not len(here) or not len(there):
-            continue
-        change = comparisons.welch(learning_curves.by_encoder(there), learning_curves.by_encoder(here), KIND)
-        one_encoder = learning_curves.design([panel[point] for panel in panels for point in (first, second)]) == "A"
-        more = record.grid.rules.encoder_allowance if one_encoder else 0.0
-        moved = change.low - more > 0 or change.high + more < 0
-        rows.append(
-            ContrastChange(
-                effects.difference_label(first, second, record.grid),
-                first,
-                second,
-                intervals.mean_interval(here),
-                intervals.mean_interval(there),
-                change,
-                "moved" if moved else "open",
-            )
-        )
+        means = [intervals.crossed(part) for part in parts]
+        if len(other_cells) == 1:
+            sign = 1.0 if other_cells == [pair[0]] else -1.0
+            parts = [replace(cells[other_cells[0]], sign=sign) for cells in (here, there)]
+        change = intervals.crossed(parts[1], replace(parts[0], sign=-parts[0].sign))
+        alone = [point[0] for cells in (here, there) for point in other_cells if _one_encoder(cells[point])]
+        bounds = change.limits(1 - record.grid.rules.alpha / len(plan), record.grid.rules.allowance(alone))
+        moved: Movement = "moved" if bounds[0] > 0 or bounds[1] < 0 else "open"
+        name = effects.difference_label(*pair, record.grid)
+        shown, there_shown = (mean.estimate() for mean in means)
+        rows.append(ContrastChange(name, *pair, shown, there_shown, change.estimate(), moved, bounds))
     return rows
+
+
+def _cells(record: SweepRecord) -> dict[Point, Sample]:
+    curves = learning_curves.panel(record.table(), ACCURACY)
+    return effects.samples(curves, effects.drive_scores(record, ACCURACY, curves))
+
+
+def _one_encoder(cell: Sample) -> bool:
+    return learning_curves.encoders(cell.values) == 1

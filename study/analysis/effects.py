@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-import numpy as np
-import pandas as pd
 from statsmodels.stats.multitest import multipletests
 
-from study.analysis import comparisons, intervals, learning_curves, predictions
-from study.analysis.intervals import Estimate
+from study.analysis import comparisons, intervals, learning_curves
+from study.analysis.drives import DriveScores, by_drive
+from study.analysis.intervals import Estimate, Sample
 from study.analysis.learning_curves import ACCURACY, Panel, Point
-from study.config.grid import Grid
+from study.config.grid import Grid, Rules
 from study.config.heads import HEAD_SETS
 from study.config.settings import FromJson, Number
 from study.results.cell_result import CellResult
@@ -30,9 +30,11 @@ MINUS = "\N{MINUS SIGN}"
 class Contrast:
     """Paired difference of two cells' final scores, first minus second, over the seeds that both have.
 
-    `p`: exact sign flips; `p_holm`: adjusted for the planned contrasts of the metric; `improvement`: probability that
-    a run of the first scores above a run of the second; `detectable`: smallest difference found with 80 % power;
-    `simultaneous`: t interval for all planned contrasts of the metric together; `episodes`: interval over test drives.
+    `p`: of the interval's own t; `p_holm`: adjusted for the planned contrasts of the metric; `improvement`: probability
+    that a run of the first scores above a run of the second; `detectable`: smallest difference found with 80 % power;
+    `simultaneous`: interval for all planned contrasts of the metric together; `allowance`: what the contrast may owe to
+    other encoders where a cell has one; `of_units`, `of_drives`: standard errors that other units and other drives
+    alone would give; `drives`: how many.
     """
 
     name: str
@@ -45,7 +47,10 @@ class Contrast:
     p_holm: Number
     improvement: Number
     detectable: Number
-    episodes: Interval | None
+    allowance: Number = 0.0
+    of_units: Number = math.nan
+    of_drives: Number = math.nan
+    drives: int = 0
 
 
 def ordered(heads: Iterable[str]) -> list[str]:
@@ -85,17 +90,33 @@ def planned(grid: Grid) -> list[tuple[Point, Point]]:
     return contrasts
 
 
+Drives = Mapping[Point, DriveScores | None]
+
+
+def samples(curves: Panel, drives: Drives) -> dict[Point, Sample]:
+    """Return the final scores of each cell by seed, with those by drive where known."""
+    return {point: Sample(learning_curves.final(frame), drives.get(point)) for point, frame in curves.items()}
+
+
+def drive_scores(record: SweepRecord, metric: str, points: Iterable[Point]) -> dict[Point, DriveScores | None]:
+    """Return a metric's scores by test drive of each cell."""
+    return {point: by_drive(results_at(record, point), metric) for point in points}
+
+
 def paired_contrasts(record: SweepRecord, metric: str, curves: Panel) -> list[Contrast]:
     """Return every planned contrast whose two cells are finished."""
     plan = planned(record.grid)
     level = 1 - record.grid.rules.alpha / max(len(plan), 1)
-    scores = {point: learning_curves.final(frame) for point, frame in curves.items()}
+    cells = samples(curves, drive_scores(record, metric, curves))
     differences = {
-        (first, second): values
+        (first, second): sample
         for first, second in plan
-        if first in scores and second in scores and len(values := comparisons.paired(scores[first], scores[second]))
+        if first in cells
+        and second in cells
+        and len((sample := comparisons.paired_sample(cells[first], cells[second])).values)
     }
-    p_values = [comparisons.sign_flip(learning_curves.by_encoder(values)) for values in differences.values()]
+    means = [intervals.crossed(sample) for sample in differences.values()]
+    p_values = [mean.p() for mean in means]
     # A contrast that is planned and not there yet counts in the family as one that shows nothing.
     family = [*p_values, *[1.0] * (len(plan) - len(p_values))]
     adjusted = multipletests(family, method="holm")[1].tolist() if family else []
@@ -105,16 +126,24 @@ def paired_contrasts(record: SweepRecord, metric: str, curves: Panel) -> list[Co
             metric,
             first,
             second,
-            intervals.mean_interval(values),
-            intervals.t_limits(learning_curves.by_encoder(values), level),
+            mean.estimate(),
+            mean.limits(level),
             p,
             p_holm,
-            comparisons.improvement(scores[first].to_numpy(), scores[second].to_numpy()),
-            comparisons.detectable(learning_curves.by_encoder(values)),
-            _episodes(record, first, second) if metric == ACCURACY else None,
+            comparisons.improvement(cells[first].values.to_numpy(), cells[second].values.to_numpy()),
+            comparisons.detectable(mean),
+            allowance(record.grid.rules, curves, (first, second)) if metric == ACCURACY else 0.0,
+            math.sqrt(mean.of_units),
+            math.sqrt(mean.of_drives),
+            mean.drives,
         )
-        for ((first, second), values), p, p_holm in zip(differences.items(), p_values, adjusted, strict=False)
+        for (first, second), mean, p, p_holm in zip(differences, means, p_values, adjusted, strict=False)
     ]
+
+
+def allowance(rules: Rules, curves: Panel, points: Iterable[Point]) -> float:
+    """Return what a contrast of some cells may owe to encoders' seeds: of those cells that have one encoder only."""
+    return rules.allowance(point[0] for point in points if learning_curves.encoders(curves[point]) == 1)
 
 
 def results_at(record: SweepRecord, point: Point) -> list[CellResult]:
@@ -124,16 +153,3 @@ def results_at(record: SweepRecord, point: Point) -> list[CellResult]:
         for key, cell in record.planned.items()
         if key in record.results and (cell.heads, cell.fraction) == point
     ]
-
-
-def _episodes(record: SweepRecord, first: Point, second: Point) -> Estimate:
-    """Return the difference in accuracy after the last epoch, with its interval over test drives of the same weight."""
-
-    def accuracy(point: Point) -> pd.Series:
-        names = ("acceleration", "acceleration_label", "episode")
-        guesses = [[result.predictions[name] for name in names] for result in results_at(record, point)]
-        return pd.concat([predictions.episode_accuracy(*guess) for guess in guesses], axis=1).mean(axis=1)
-
-    return intervals.t_interval(
-        comparisons.paired(accuracy(first), accuracy(second)).to_numpy(np.float64), "t, over test drives"
-    )

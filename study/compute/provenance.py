@@ -6,6 +6,7 @@ No user, host or folder names: results are passed on.
 from __future__ import annotations
 
 import contextlib
+import datetime as dt
 import hashlib
 import importlib.metadata
 import os
@@ -25,6 +26,8 @@ NEW_FILES = ("study", "sweeps", "tests", "benchmarks")  # elsewhere a new file m
 def provenance(root: Path = ROOT) -> dict[str, Any]:
     """Return what computes here: `commit`, `dirty`, `diff`, `lock`, `packages`, `python`, `platform`, `cpu`, `cores`.
 
+    And when it was asked: `time`, in UTC to the second.
+
     Outside a git checkout `commit` is the one that `git archive` wrote down or None, `dirty` False and `diff` empty;
     `lock` is the sha256 of requirements.lock or None, `diff_digest` that of the diff or None. A diff beyond 1 MB is
     cut, and says so in its last line.
@@ -35,6 +38,7 @@ def provenance(root: Path = ROOT) -> dict[str, Any]:
     diff = _diff(root) if commit else ""
     lock = root / "requirements.lock"
     return {
+        "time": dt.datetime.now(dt.UTC).isoformat(timespec="seconds"),
         "commit": commit or _archived(root),
         "dirty": bool(diff),
         "diff": diff,

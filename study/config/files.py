@@ -9,6 +9,7 @@ import yaml
 from pydantic import ValidationError
 
 from study.config.grid import Grid
+from study.config.heads import HEAD_SETS
 from study.config.settings import Model, StudySettings
 from study.config.workspace import HERE
 from study.errors import BadInputError, one_of
@@ -89,11 +90,17 @@ def load_grid(
 
 
 def _of_profile(value: object, profile: str) -> object:
-    """Return a rule's number for a profile; leave what is no such choice to validation."""
-    if not isinstance(value, dict):
+    """Return a rule for a profile, the largest where it is not named; leave what is no such choice to validation."""
+    if not isinstance(value, dict) or not value or set(value) & set(HEAD_SETS):
         return value
-    numbers = [each for each in value.values() if isinstance(each, int | float)]
-    return value.get(profile, max(numbers)) if len(numbers) == len(value) > 0 else value
+    choices = list(value.values())
+    if profile in value:
+        return value[profile]
+    if all(isinstance(each, int | float) for each in choices):
+        return max(choices)
+    if all(isinstance(each, dict) and each for each in choices):
+        return {name: max(each.get(name, max(each.values())) for each in choices) for name in set().union(*choices)}
+    return value
 
 
 def load_profile(name: str, overrides: dict[str, Any] | None = None, folder: Path = HERE.sweeps) -> StudySettings:

@@ -20,16 +20,16 @@ from study.figures.style import BLUE, GREY, SIDES, STYLE, literal, look, new_fig
 
 
 @mpl.rc_context(STYLE)
-def differences(rows: Sequence[Mapping[str, float | str]], allowance: float) -> Figure:
+def differences(rows: Sequence[Mapping[str, float | str]]) -> Figure:
     """Draw paired differences in accuracy [points]: thick bar 95 % interval, thin bar simultaneous interval.
 
-    Each row has name, value, low, high, low_all, high_all (shares, not points). The grey zone is the allowance for
-    other encoders, 0 for none.
+    Each row has name, value, low, high, low_all, high_all (shares, not points). The grey zone is the row's `allowance`
+    for other encoders, 0 for none.
     """
     figure, (axes,) = new_figure(0.7 + 0.24 * len(rows))
-    axes.axvspan(-100 * allowance, 100 * allowance, color=GREY, alpha=0.15, linewidth=0)
     value, low, high, least, most = _columns(rows, ("value", "low", "high", "low_all", "high_all"))
-    places = np.arange(len(rows))
+    places, (allowance,) = np.arange(len(rows)), _columns(rows, ("allowance",))
+    axes.barh(places, 2 * allowance, 1.0, -allowance, color=GREY, alpha=0.15, linewidth=0)
     axes.hlines(places, least, most, color=BLUE, linewidth=0.8)
     axes.hlines(places, low, high, color=BLUE, linewidth=2.6)
     axes.plot(value, places, "o", color="black", markersize=3.5)

@@ -10,6 +10,8 @@ import math
 from collections.abc import Iterator
 from functools import partial
 
+import numpy as np
+
 from study.analysis import comparisons
 from study.analysis.claims import Verdict
 from study.analysis.effects import MINUS, ordered
@@ -48,7 +50,7 @@ def compare(first: Report, second: Report, names: tuple[str, str], picture: str 
         same=same,
         both=both,
         changes=[change for metric in _shared_metrics(sides) for change in _changes(sides, metric.name, both)],
-        allowance=max(side.rules.get("encoder_allowance", 0.0) for side in sides),
+        allowance=max((row.allowance for side in sides for row in side.accuracy_contrasts), default=0.0),
         shared=[f"{cells[point]} ({words})" for point in both if (words := _shared(sides, point))],
         scores=[_scores(sides, metric, cells, both) for metric in _shared_metrics(sides)],
         alone=[
@@ -124,7 +126,8 @@ def _facts(report: Report) -> Iterator[tuple[str, str]]:
     yield "machine platform", str(origin.platform)
     yield "machine cpu", str(origin.cpu)
     for name, rule in report.rules.items():
-        yield f"rules {name}", f"{rule:g}"
+        for part, number in rule.items() if isinstance(rule, dict) else [("", rule)]:
+            yield f"rules {name} {part}".strip(), f"{number:g}" if isinstance(number, float) else str(number or "none")
     for setting in report.settings:
         yield f"settings {setting.group}.{setting.name}", setting.value
 
@@ -171,15 +174,17 @@ def _beside(metric: Metric, first: Spread | None, second: Spread | None) -> list
 
 
 def difference(first: Spread, second: Spread) -> Estimate:
-    """Return second minus first, with a 95 % interval over their sampling units.
+    """Return second minus first, with a 95 % interval over their sampling units and test drives.
 
     Paired by seed where both have the same seeds: seed k starts from the same initial weights whatever the data, which
     binds steering losses together (r = 0.8 between cells of the laptop profile) and accuracies not (r = 0.0). Pairs are
     right either way and cost little where nothing is shared. Otherwise two separate samples (Welch's t).
     """
-    if first.kind == second.kind and set(first.units) == set(second.units):
-        return comparisons.paired_t([second.units[seed] - value for seed, value in first.units.items()])
-    return comparisons.welch(list(second.units.values()), list(first.units.values()))
+    same = [first.units, first.drives, first.more] == [second.units, second.drives, second.more]
+    drives = [] if same else [(side.more, side.drives) for side in (first, second)]  # of one result, nothing differs
+    paired = set(first.units) == set(second.units) and len({"policy" in side.kind for side in (first, second)}) == 1
+    before, after = (np.array([side.units[seed] for seed in sorted(side.units)]) for side in (first, second))
+    return comparisons.apart(after, before, drives, by_seed=paired)
 
 
 def _shared(sides: Sides, point: Point) -> str:

@@ -89,10 +89,12 @@ def _differences(report: Report) -> Drawing | None:
     rows = report.accuracy_contrasts
     if not rows or math.isnan(rows[0].difference.low):
         return None
-    allowance = report.rules["encoder_allowance"] if report.sweep.design == "A" else 0.0
     ends = [dict(zip(("low_all", "high_all"), row.simultaneous, strict=True)) for row in rows]
     return differences.differences(
-        [{"name": row.name, **asdict(row.difference), **end} for row, end in zip(rows, ends, strict=True)], allowance
+        [
+            {"name": row.name, "allowance": row.allowance, **asdict(row.difference), **end}
+            for row, end in zip(rows, ends, strict=True)
+        ]
     )
 
 

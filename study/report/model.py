@@ -74,7 +74,10 @@ class Scale(Part):
 
 
 class Spread(Part):
-    """A final score over seeds; `units` has the value of each sampling unit by its seed."""
+    """A final score over seeds and, where `drives` says so, test drives.
+
+    `units` has the value of each sampling unit by its seed; `more`: the standard error that drives add to theirs.
+    """
 
     mean: float
     sd: Number
@@ -84,6 +87,8 @@ class Spread(Part):
     n: int
     kind: str
     units: dict[int, float]
+    drives: int = 0
+    more: float = 0.0
 
 
 class Score(Part):
@@ -147,6 +152,11 @@ class VariedSetting(Part):
     contrasts: tuple[confounds.ContrastChange, ...]
 
     @property
+    def room(self) -> float:
+        """Return the largest change that the bounds of the open contrasts leave possible."""
+        return max((abs(end) for row in self.contrasts for end in row.bounds if row.state == "open"), default=math.nan)
+
+    @property
     def flipped(self) -> list[str]:
         """Return the names of the contrasts whose sign differs between the two values."""
         return [row.name for row in self.contrasts if row.here.value * row.there.value < 0]
@@ -194,7 +204,11 @@ class Cost(Part):
 
 
 class Provenance(Part):
-    """Where the numbers come from; `cell_commits` has several entries where cells come from different commits."""
+    """Where the numbers come from; `cell_commits` has several entries where cells come from different commits.
+
+    `cell_times`: when the first and the last cell began, in UTC, of those whose results say so; `undated`: how many do
+    not.
+    """
 
     commit: str | None
     dirty: bool | None
@@ -206,6 +220,8 @@ class Provenance(Part):
     diff_lines: int
     packages: dict[str, str]
     cell_commits: tuple[str, ...]
+    cell_times: tuple[str, ...] = ()
+    undated: int = 0
     command: str
     keys: dict[str, str]
 
@@ -225,13 +241,20 @@ class Report(Part):
     convergence: tuple[Convergence, ...]
     confounds: tuple[VariedSetting, ...] = ()
     claims: tuple[Verdict, ...]
-    rules: dict[str, float]
+    rules: dict[str, float | dict[str, float] | dict[str, str] | None]
     settings: tuple[Setting, ...]
     parameters: dict[str, int]
     data: Data
     cost: Cost
     provenance: Provenance
     figures: tuple[str, ...] = ()
+
+    @property
+    def rules_are_younger(self) -> bool:
+        """Return whether the rules were last changed on a later day than a cell was computed."""
+        fixed = self.rules.get("fixed")
+        times = self.provenance.cell_times
+        return isinstance(fixed, dict) and bool(times) and str(fixed["date"]) > times[0][:10]
 
     @property
     def by_point(self) -> dict[Point, Score]:

@@ -11,9 +11,21 @@ from typing import Literal
 import numpy as np
 import pandas as pd
 
-from study.analysis import claims, confounds, convergence, effects, intervals, learning_curves, metrics, predictions
+from study.analysis import (
+    claims,
+    comparisons,
+    confounds,
+    convergence,
+    effects,
+    intervals,
+    learning_curves,
+    metrics,
+    predictions,
+)
+from study.analysis.drives import by_drive
+from study.analysis.intervals import Crossed, Sample
 from study.analysis.learning_curves import ACCURACY, STEERING, Point
-from study.analysis.metrics import METRICS
+from study.analysis.metrics import METRICS, Metric
 from study.config.baselines import BASELINES, CEILING
 from study.config.heads import HEADS, heads_of
 from study.config.paper import parameter_counts
@@ -48,7 +60,8 @@ def summarise(record: SweepRecord) -> Report:
     panels = {name: learning_curves.panel(record.table(), name) for name in (ACCURACY, STEERING)}
     accuracy = panels[ACCURACY]
     finished = {point: accuracy[point] for point in effects.points(grid) if point in accuracy}
-    base = accuracy.get((grid.baseline, max(grid.fractions)))
+    reference = (grid.baseline, max(grid.fractions))
+    base, cells = accuracy.get(reference), effects.samples(accuracy, effects.drive_scores(record, ACCURACY, accuracy))
     floor, counts = _floor(record), parameter_counts()
     beside, ends = _baselines(record)
     contrasts = (effects.paired_contrasts(record, name, panel) for name, panel in panels.items())
@@ -64,7 +77,13 @@ def summarise(record: SweepRecord) -> Report:
         comparisons=tuple(itertools.chain.from_iterable(contrasts)),
         planned_contrasts=len(effects.planned(grid)),
         convergence=tuple(
-            _convergence(point, effects.label(point, grid), curves, base)
+            _convergence(
+                point,
+                effects.label(point, grid),
+                curves,
+                base,
+                comparisons.difference(cells[point], cells[reference]),
+            )
             for point, curves in finished.items()
             if base is not None
         ),
@@ -126,8 +145,13 @@ def _baselines(record: SweepRecord) -> tuple[tuple[Score, ...], tuple[float, flo
     return tuple(_score(record, point, words[point], frame, ends) for point, frame in finished.items()), ends
 
 
-def _spread(scores: pd.Series) -> Spread:
-    interval = intervals.mean_interval(scores)
+def _spread(results: list[CellResult], metric: Metric) -> Spread | None:
+    """Return a metric over the policies of some results and, where it is known by drive, over test drives."""
+    scores = metrics.scores(results, metric)
+    if scores.empty:
+        return None
+    mean = intervals.crossed(Sample(scores, by_drive(results, metric.name)))
+    interval = mean.estimate()
     return Spread(
         mean=interval.value,
         sd=float(scores.std(ddof=1)) if len(scores) > 1 else math.nan,
@@ -137,6 +161,8 @@ def _spread(scores: pd.Series) -> Spread:
         n=interval.n,
         kind=interval.kind,
         units=learning_curves.by_seed(scores).to_dict(),
+        drives=mean.drives,
+        more=mean.more,
     )
 
 
@@ -147,15 +173,16 @@ def _score(record: SweepRecord, point: Point, cell: str, curves: pd.DataFrame, e
         predictions.confusion(result.predictions["acceleration"], result.predictions["acceleration_label"])
         for result in results
     ]
-    scores = {name: metrics.scores(results, metric) for name, metric in METRICS.items()}
-    gain, room = float(scores[ACCURACY].mean()) - ends[0], ends[1] - ends[0]
+    spreads = {name: _spread(results, metric) for name, metric in METRICS.items()}
+    scores = {name: spread for name, spread in spreads.items() if spread}
+    gain, room = scores[ACCURACY].mean - ends[0], ends[1] - ends[0]
     return Score(
         cell=cell,
         heads=point[0],
         fraction=point[1],
         encoders=len(results),
-        n=len(scores[ACCURACY]),
-        metrics={name: _spread(values) for name, values in scores.items() if len(values)},
+        n=len(curves),
+        metrics=scores,
         gain=gain,
         share=gain / room if room > 0 else math.nan,
         confusion=np.concatenate(recall).mean(axis=0).tolist(),
@@ -165,7 +192,7 @@ def _score(record: SweepRecord, point: Point, cell: str, curves: pd.DataFrame, e
     )
 
 
-def _convergence(point: Point, cell: str, curves: pd.DataFrame, base: pd.DataFrame) -> Convergence:
+def _convergence(point: Point, cell: str, curves: pd.DataFrame, base: pd.DataFrame, difference: Crossed) -> Convergence:
     target = float(learning_curves.final(base).mean())
     by_seed = convergence.reach_by_seed(curves, target)
     return Convergence(
@@ -173,7 +200,7 @@ def _convergence(point: Point, cell: str, curves: pd.DataFrame, base: pd.DataFra
         fraction=point[1],
         heads=point[0],
         target=target,
-        mean_curve=convergence.epochs_to_reach(curves, base),
+        mean_curve=convergence.epochs_to_reach(curves, base, difference),
         median=by_seed.median,
         share=by_seed.share,
         area=by_seed.area,
@@ -290,12 +317,16 @@ def _cost(record: SweepRecord) -> Cost:
 def _provenance(record: SweepRecord) -> Provenance:
     origin = record.provenance
     packages = origin.get("packages", {})
-    commits = {result.facts.get("provenance", {}).get("commit") for result in record.results.values()}
+    origins = [result.facts.get("provenance", {}) for result in record.results.values()]
+    commits = {each.get("commit") for each in origins}
+    times = sorted(each["time"] for each in origins if each.get("time"))
     return Provenance(
         **{name: origin.get(name) for name in ("commit", "dirty", "lock", "python", "platform", "cpu", "cores")},
         diff_lines=len(str(origin.get("diff") or "").splitlines()),
         packages={name: packages[name] for name in SHOWN_PACKAGES if name in packages},
         cell_commits=tuple(sorted(str(commit) for commit in commits if commit)),
+        cell_times=(times[0], times[-1]) if times else (),
+        undated=len(origins) - len(times),
         command=origin.get("command", f"python -m study.sweep {record.grid.name} --profile {record.profile}"),
         keys={cell.label: key for key, cell in record.planned.items()},
     )

@@ -73,7 +73,6 @@ def _lists(report: Report) -> dict[str, Any]:
             f"{row.cell} {percent(row.metrics[KEYFRAME].mean)} %" for row in ends if KEYFRAME in row.metrics
         ),
         "about": {name: baseline.about for name, baseline in BASELINES.items()},
-        "drives": counts(row.episodes.n for row in report.accuracy_contrasts if row.episodes),
         "unseen": "; ".join(unseen),
         "main": {"about": _about(main), "table": main_scores(report, main)},
         "further": [
@@ -153,9 +152,9 @@ def key_numbers(claim: Verdict) -> str:
     if not claim.findings:
         return claim.reason
     unit = UNITS[claim.findings[0].unit]
-    values = [unit.show(finding.estimate.value) for finding in claim.findings]
+    values = [unit.show(finding.estimate.value) for finding in claim.deciding]
     if len(values) > 5 and not {NOTHING, "never"} & set(values):
-        ordered = sorted(claim.findings, key=lambda finding: finding.estimate.value)
+        ordered = sorted(claim.deciding, key=lambda finding: finding.estimate.value)
         return unit.phrase.format(" to ".join(unit.show(ordered[place].estimate.value) for place in (0, -1)))
     listed = ", ".join(values)
     return unit.phrase.format(f"({listed})" if LOSS in unit.phrase and len(values) > 1 else listed)

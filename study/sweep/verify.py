@@ -184,7 +184,7 @@ def verify(plan: Plan, tracking: str, wanted: str | None, seed: int) -> int:
     plan.workspace.data.mkdir(exist_ok=True)
     with plan_display(plan, [key]) as display:
         again = compute_again(plan, recorded, display)
-    return report(recorded, again, plan.grid.rules.encoder_allowance)
+    return report(recorded, again, plan.grid.rules.allowance([recorded.cell.heads] * 2))
 
 
 def report(recorded: CellResult, again: CellResult, allowance: float) -> int:

@@ -275,7 +275,7 @@ def _short(text: str) -> str:
 
 def _params(values: Mapping[str, Any]) -> list[Param]:
     texts = {name: value if isinstance(value, str) else json.dumps(value) for name, value in values.items()}
-    return [Param(name, _short(text)) for name, text in texts.items()]
+    return [Param(name.replace("+", "_"), _short(text)) for name, text in texts.items()]  # MLflow takes no plus
 
 
 def _tags(values: Mapping[str, str]) -> list[RunTag]:

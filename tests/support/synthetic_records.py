@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 import numpy as np
 import pandas as pd
 
-from study.analysis.claims import Evidence
 from study.config.grid import Grid
 from study.config.heads import HEAD_SETS
 from study.config.paper import ACCELERATION_HIDDEN, CHANNELS, CORE, KERNEL, LATENT, STEERING_HIDDEN
@@ -24,7 +23,7 @@ class World:
     """Holds the true effects of a study: accuracies and time constants by head set, noise by level."""
 
     accuracy: dict[str, float] = field(
-        default_factory=lambda: {"rec": 0.815, "rec+pred": 0.838, "rec+plan": 0.862, "full": 0.886}
+        default_factory=lambda: {"rec": 0.78, "rec+pred": 0.83, "rec+plan": 0.88, "full": 0.93}
     )
     time: dict[str, float] = field(
         default_factory=lambda: {"rec": 28.0, "rec+pred": 20.0, "rec+plan": 12.0, "full": 9.0}
@@ -34,7 +33,7 @@ class World:
     )
     by_fraction: float = 0.01  # accuracy lost for each halving of the data, rec; the others lose half of it
     slower: float = 0.25  # share by which learning is slower for each halving of the data
-    steering: float = 0.0011
+    steering: float = 0.0002
     steering_effect: float = 0.0
     encoder_sd: float = 0.0
     policy_sd: float = 0.002
@@ -44,7 +43,7 @@ class World:
 
 
 HEADS_GRID = Grid(
-    name="heads", title="Effect of different heads", heads=tuple(HEAD_SETS), claims=("H1", "H2", "H3", "H4", "H5")
+    name="heads", title="Effect of different heads", heads=tuple(HEAD_SETS), claims=("H0", "H1", "H2", "H3", "H4", "H5")
 )
 DATASIZE_GRID = Grid(
     name="datasize",
@@ -53,70 +52,6 @@ DATASIZE_GRID = Grid(
     fractions=(1.0, 0.5, 0.25, 0.125, 0.0625),
     claims=("D1", "D2", "D3", "D4"),
 )
-
-
-# --- null studies: every cell is a copy of rec ----------------------------------------------------------------------
-
-# Accuracy and steering loss of rec by epoch, as the laptop profile's `heads` has them (reports/reference/heads).
-REC_EPOCHS = np.array([1, 2, 5, 10, 20, 50, 100])
-REC_ACCURACY = np.array([0.674, 0.720, 0.756, 0.792, 0.8076, 0.8284, 0.846])
-FAST_ACCURACY = np.array([0.674, 0.74, 0.80, 0.835, 0.8455, 0.846, 0.846])  # of a copy that is done after 20 epochs
-REC_STEERING = np.array([2.7, 2.3, 1.73, 1.21, 0.79, 0.43, 0.27]) * 1e-3
-STEERING_FLOOR = 0.00482  # loss of the best constant command there
-
-
-@dataclass(frozen=True)
-class Null:
-    """Holds the spread of copies of rec, as sd of accuracy unless stated; defaults are the laptop profile's.
-
-    A policy's deviation is its start, gone after a few epochs; a slow wander (correlation 0.95 from epoch to epoch);
-    and noise of each epoch. Steering losses go with their policy seed in all cells (r = 0.8), accuracies do not (0.0).
-    `encoder` is what an encoder's seed does to all its policies, test drives that it happens to suit among it;
-    `encoder_steering` the same for the log of the steering loss.
-    """
-
-    encoder: float = 0.0
-    encoder_steering: float = 0.0
-    spread: float = 0.0  # sd over encoders of the log of their policies' sd
-    start: float = 0.03
-    wander: float = 0.003
-    epoch: float = 0.0013
-    steering: float = 0.08  # sd over policies of the log of the steering loss
-    epochs: int = 100
-    fast: bool = False
-
-    def mean_curve(self):
-        """Return accuracy by epoch without any spread."""
-        curve = FAST_ACCURACY if self.fast else REC_ACCURACY
-        return np.interp(np.log(np.arange(1, self.epochs + 1)), np.log(REC_EPOCHS), curve)
-
-    def evidence(self, grid, seed):
-        """Return the evidence that `study.analysis.claims` weighs, for a study of that grid."""
-        rng = np.random.default_rng(seed)
-        epoch = np.arange(1, self.epochs + 1)
-        mean, loss = self.mean_curve(), np.interp(np.log(epoch), np.log(REC_EPOCHS), REC_STEERING)
-        shape = (grid.encoder_seeds, grid.policy_seeds)
-        shared = rng.normal(size=shape)
-        index = pd.MultiIndex.from_product([range(n) for n in shape], names=["encoder_seed", "policy_seed"])
-        accuracy, steering = {}, {}
-        for point in {(cell.heads, cell.fraction): None for cell in grid.cells()}:
-            own = rng.normal(size=(*shape, self.epochs))
-            slow = np.empty_like(own)
-            slow[..., 0] = own[..., 0]
-            for k in range(1, self.epochs):
-                slow[..., k] = 0.95 * slow[..., k - 1] + np.sqrt(1 - 0.95**2) * own[..., k]
-            start = rng.normal(size=(*shape, 1)) * np.exp(-(epoch - 1) / 1.5)
-            wide = np.exp(self.spread * rng.normal(size=(shape[0], 1, 1)))
-            shift = self.encoder * rng.normal(size=(shape[0], 1, 1))
-            noise = self.epoch * rng.normal(size=own.shape)
-            values = mean + shift + wide * (self.start * start + self.wander * slow) + noise
-            log = np.sqrt(0.8) * shared + np.sqrt(0.2) * rng.normal(size=shape)
-            log = self.steering * log + self.encoder_steering * rng.normal(size=(shape[0], 1))
-            losses = loss * np.exp(log[..., None] + 0.05 * rng.normal(size=own.shape))
-            accuracy[point], steering[point] = (
-                pd.DataFrame(part.reshape(-1, self.epochs), index=index, columns=epoch) for part in (values, losses)
-            )
-        return Evidence(grid, accuracy, steering, STEERING_FLOOR)
 
 
 # --- records --------------------------------------------------------------------------------------------------------
@@ -210,7 +145,7 @@ def simulate_cell(cell, key, settings, world, seeds, rng, labels):
             "speed": (10 * rng.random(FRAMES) * (acceleration > 0)).astype(np.float32),
             "light": np.where(acceleration == 0, 2, 0).astype(np.uint8),
             "lead_gap": np.where(rng.random(FRAMES) < 0.5, np.nan, 20.0).astype(np.float32),
-            "keyframe": rng.random(FRAMES) < 0.3,
+            "keyframe": np.arange(FRAMES) % 10 < 3,
             "weight": rng.uniform(0.5, 1.5, FRAMES).astype(np.float32),
             "z": (rng.normal(size=(FRAMES, 64)) + np.eye(64)[0] * 2 * acceleration[:, None]).astype(np.float32),
         },
@@ -224,6 +159,7 @@ def simulate_cell(cell, key, settings, world, seeds, rng, labels):
                 "policy_test": FRAMES,
             },
             "seconds": {"encoder": 412.0 * cell.fraction, "encode": 6.1, "policies": 131.0, "cell": 551.0},
+            "provenance": {"commit": "0123456789abcdef0123456789abcdef01234567", "time": "2026-05-01T12:00:00+00:00"},
             "peak_bytes": 1_300_000_000,
             "device": "cpu",
             "precision": "fp32",
