@@ -69,7 +69,10 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "limits-hold": _setting(0, 0.5, limits=True),
     "limits-lag-0.4": _setting(0.4, 0, limits=True),
     "limits-lag-0.4-wheel": _setting(0.4, 0, wheel=0.1, limits=True),
+    "limits-lag-0.4-hold-0.2": _setting(0.4, 0.2, limits=True),
+    "limits-lag-0.4-hold-0.3": _setting(0.4, 0.3, limits=True),
     "limits-lag-0.4-hold": _setting(0.4, 0.5, limits=True),
+    "limits-lag-0.2-hold-0.2": _setting(0.2, 0.2, limits=True),
     "limits-lag-0.4-towns": _setting(0.4, 0, limits=True, per_drive=True),
 }
 
