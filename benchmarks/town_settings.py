@@ -73,6 +73,9 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "limits-lag-0.4-hold-0.3": _setting(0.4, 0.3, limits=True),
     "limits-lag-0.4-hold": _setting(0.4, 0.5, limits=True),
     "limits-lag-0.2-hold-0.2": _setting(0.2, 0.2, limits=True),
+    "limits-lag-0.1-hold-0.2": _setting(0.1, 0.2, limits=True),
+    "limits-hold-0.2": _setting(0, 0.2, limits=True),
+    "lag-0.2-hold-0.2": _setting(0.2, 0.2),
     "limits-lag-0.4-towns": _setting(0.4, 0, limits=True, per_drive=True),
 }
 
