@@ -11,13 +11,17 @@ import pytest
 from pypdf import PdfReader
 
 from study.config.files import load_profile
-from study.config.grid import Grid
+from study.config.grid import Grid, Rules
 from study.errors import BadInputError
 from study.report import __main__, build
 from study.report.build import build_report
+from study.report.markdown import markdown
 from study.report.scale import training_scale
 from study.report.summary import summarise
+from study.report.text import document
 from tests.support.synthetic_records import DATASIZE_GRID, HEADS_GRID, World, simulate
+
+SMALL = Grid(name="small", title="T", heads=("rec", "full"), policy_seeds=3, baselines=())
 
 
 def pages(pdf):
@@ -142,6 +146,26 @@ def test_a_report_on_imported_drives_names_their_writer_and_not_our_town(incompl
     text = pdf_text(incomplete / "heads.pdf")
     assert "imported drives, written by lab logger 3" in text
     assert "a town of our own" not in text
+
+
+@pytest.mark.parametrize(("date", "younger"), [("2026-04-30", False), ("2026-05-02", True)])
+def test_a_report_says_when_its_rules_are_younger_than_its_cells(date, younger):
+    rules = Rules.model_validate({"fixed": {"date": date, "commit": "ab" * 20}})
+    record = simulate(SMALL.model_copy(update={"rules": rules}), World(epochs=6))  # of cells begun on 2026-05-01
+    text = markdown(document(summarise(record)))
+    assert f"Rules of {date}, commit `ababababab`; cells computed from 2026-05-01 to 2026-05-01" in text
+    assert ("The rules were changed after cells of this sweep were computed" in text) == younger
+
+
+def test_a_report_says_when_nothing_is_known_of_its_rules_or_cells():
+    record = simulate(SMALL, World(epochs=6))
+    assert "When the rules were fixed is not recorded" in markdown(document(summarise(record)))
+    rules = Rules.model_validate({"fixed": {"date": "2026-05-02", "commit": "ab" * 20}})
+    old = {key: replace(result, facts={**result.facts, "provenance": {}}) for key, result in record.results.items()}
+    record = replace(record, grid=SMALL.model_copy(update={"rules": rules}), results=old)
+    assert "results do not say when computed: whether the rules are older is unknown" in markdown(
+        document(summarise(record))
+    )
 
 
 def test_unfinished_and_failed_cells_are_named_on_the_first_page(incomplete):
