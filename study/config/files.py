@@ -99,7 +99,8 @@ def _of_profile(value: object, profile: str) -> object:
     if all(isinstance(each, int | float) for each in choices):
         return max(choices)
     if all(isinstance(each, dict) and each for each in choices):
-        return {name: max(each.get(name, max(each.values())) for each in choices) for name in set().union(*choices)}
+        names = dict.fromkeys(name for each in choices for name in each)
+        return {name: max(each.get(name, max(each.values())) for each in choices) for name in names}
     return value
 
 
