@@ -47,7 +47,7 @@ SIZE = {
     "recording": {"encoder_episodes": 6, "policy_episodes": 32},
     "frames": {"encoder": 2000, "policy": 4000},
 }
-OLD = {"dynamics": {"steering_unit": 2.4}, "town": {"per_drive": True, "brake_hold": 0.5}}
+OLD = {"dynamics": {"steering_unit": 2.4}, "town": {"per_drive": True, "brake_hold": 0.5, "road_limits": []}}
 LIMITS = [20.0, 30.0, 40.0]  # above 40 km/h, braking for a light begins before the light is in the picture
 
 

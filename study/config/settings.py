@@ -47,15 +47,16 @@ class TownSettings(Settings):
     dropped_edges: Annotated[int, Field(ge=0)] = Field(3, description="streets left out of the full grid")
     two_lane_share: Share = Field(0.4, description="share of streets with two lanes each way")
     vehicles: Count = Field(100, description="vehicles in the town (Sec. IV-A: 100)")
-    speed_limit: Positive = Field(40.0, description="the town's one speed limit [km/h]")
+    speed_limit: Positive = Field(40.0, description="the one speed limit of a town without road_limits [km/h]")
     road_limits: tuple[Positive, ...] = Field(
-        (), description="limits to draw for each road [km/h]; empty: one limit everywhere. Drawn into the map layer"
+        (20.0, 30.0, 40.0),
+        description="limits to draw for each road [km/h]; empty: speed_limit everywhere. The map layer shows them",
     )
     green: Positive = Field(8.0, description="green of one phase: approaches across from each other together [s]")
     yellow: Positive = Field(1.5, description="yellow [s]")
     all_red: NotNegative = Field(1.0, description="all approaches red [s]")
     brake_hold: NotNegative = Field(
-        0.5, description="a brake, once on, is held at least this long [s]; 0 is literal CARLA"
+        0.2, description="a brake, once on, is held at least this long [s]; 0 is literal CARLA"
     )
     per_drive: bool = Field(
         default=False,
