@@ -30,7 +30,9 @@ EPOCHS, SEEDS = 6, 3
 SETTINGS = StudySettings()
 DATA = {"key": "f" * 16, "frames": {"encoder": 100, "policy": 50}}
 ORIGIN = {"commit": "c" * 40, "dirty": True, "diff": "+A = 2\n", "packages": {"numpy": "2"}, "cores": 2}
-GRID = Grid(name="heads", title="Effect of different heads", heads=("rec", "full"), policy_seeds=SEEDS)
+GRID = Grid(
+    name="heads", title="Effect of different heads", heads=("rec", "full"), policy_seeds=SEEDS, baselines=("state",)
+)
 
 
 def make_result(cell, key, seed=0):
