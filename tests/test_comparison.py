@@ -101,12 +101,12 @@ def test_rows_have_as_many_cells_as_their_heads(pair, text, content):
 
 def test_the_difference_to_the_baseline_has_the_same_sign_whichever_head_set_that_is(content):
     one = checked(content, "a")
-    other = checked(made(simulate(SMALL.model_copy(update={"baseline": "full"}), FAST)), "b")
-    above, below = one.above_baseline(("full", 1.0)), other.above_baseline(("rec", 1.0))
+    other = checked(made(simulate(SMALL.model_copy(update={"reference": "full"}), FAST)), "b")
+    above, below = one.above_reference(("full", 1.0)), other.above_reference(("rec", 1.0))
     assert 0 < above.low < above.value < above.high
     assert (below.low, below.value, below.high) == (-above.high, -above.value, -above.low)
-    assert one.above_baseline(("rec", 1.0)) is None
-    assert one.above_baseline(("full", 0.5)) is None
+    assert one.above_reference(("rec", 1.0)) is None
+    assert one.above_reference(("full", 0.5)) is None
 
 
 def test_an_order_that_changed_and_verdicts_that_changed_are_named(text):

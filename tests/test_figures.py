@@ -236,7 +236,7 @@ def test_two_sweeps_differ_by_marker_and_fill_and_share_the_head_sets_colours(tw
     }
     assert marks(left) == expected
     gains = {
-        (round(100 * report.above_baseline(point).value, 6), *mark)
+        (round(100 * report.above_reference(point).value, 6), *mark)
         for report, mark in zip(reports, (("o", True), ("D", False)), strict=True)
         for point in report.by_point
         if point[0] != "rec"

@@ -192,7 +192,7 @@ def test_a_sweep_without_any_result_still_gives_a_report(tmp_path):
     "grid",
     [
         Grid(name="small", title="Two cells, one seed", heads=("rec", "full"), policy_seeds=1),
-        Grid(name="only", title="No baseline", heads=("full",), fractions=(0.5,), policy_seeds=2),
+        Grid(name="only", title="No reference", heads=("full",), fractions=(0.5,), policy_seeds=2),
         Grid(name="encoders", title="Design B", heads=("rec", "full"), encoder_seeds=3, policy_seeds=2),
     ],
     ids=lambda grid: grid.name,

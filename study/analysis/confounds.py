@@ -142,13 +142,13 @@ def value(settings: StudySettings, setting: str) -> str:
 def pairs(grid: Grid, confound: Confound) -> list[tuple[Point, Point]]:
     """Return the contrasts that a confound may move: all pairs of head sets at each fraction, and across fractions.
 
-    Across fractions, every head set with part of the data is set against the baseline with all of it, as the claims
+    Across fractions, every head set with part of the data is set against the reference with all of it, as the claims
     about data size do. What matters below all the data only leaves out the pairs at all the data.
     """
     top = max(grid.fractions)
     plan = [pair for pair in effects.planned(grid) if not confound.fractions or pair[0][1] != top]
-    across = [(point, (grid.baseline, top)) for point in effects.points(grid) if point[1] != top]
-    return list(dict.fromkeys([*plan, *across] if grid.baseline in grid.heads else plan))
+    across = [(point, (grid.reference, top)) for point in effects.points(grid) if point[1] != top]
+    return list(dict.fromkeys([*plan, *across] if grid.reference in grid.heads else plan))
 
 
 def contrasts(record: SweepRecord, other: SweepRecord, confound: Confound) -> list[ContrastChange]:

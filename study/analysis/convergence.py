@@ -23,27 +23,27 @@ def first_reach(curve: Array, target: float) -> Array:
 
 
 def epochs_to_reach(
-    curves: pd.DataFrame, baseline: pd.DataFrame, drives: Crossed | None = None, last: int = LAST
+    curves: pd.DataFrame, reference: pd.DataFrame, drives: Crossed | None = None, last: int = LAST
 ) -> Estimate:
-    """Return the first epoch at which the mean curve reaches the baseline's final score (Sec. V-A), or infinity.
+    """Return the first epoch at which the mean curve reaches the reference's final score (Sec. V-A), or infinity.
 
     The interval is a percentile one over resampled seeds (encoders, then policies), the same in both where both have
-    them; the baseline's final score is drawn anew with them. `drives`: the difference of the two cells' final scores.
+    them; the reference's final score is drawn anew with them. `drives`: the difference of the two cells' final scores.
     Curves by drive are not stored, so each resample's curve is shifted by what other test drives may add to that
     difference, at every epoch alike.
     """
-    value = float(first_reach(curves.mean().to_numpy(), float(final(baseline, last).mean())))
+    value = float(first_reach(curves.mean().to_numpy(), float(final(reference, last).mean())))
     if len(curves) < 2:
         return Estimate(value, math.nan, math.nan, len(curves), "no interval from one seed")
     generator = rng(0, "epochs to reach")
-    shared = curves.index.equals(baseline.index)
+    shared = curves.index.equals(reference.index)
     weights = _resampled(curves, generator)
-    others = weights if shared else _resampled(baseline, generator)
+    others = weights if shared else _resampled(reference, generator)
     kind, shift = "percentile bootstrap of the mean curve, over seeds", np.zeros(len(weights))
     if drives is not None and drives.drives:
         kind += f", shifted by draws of {drives.drives} test drives"
         shift = drives.more * generator.standard_t(drives.drives - 1, len(weights))
-    reached = first_reach(weights @ curves.to_numpy() + shift[:, None], others @ final(baseline, last).to_numpy())
+    reached = first_reach(weights @ curves.to_numpy() + shift[:, None], others @ final(reference, last).to_numpy())
     low, high = np.quantile(reached, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], method="closest_observation")
     return Estimate(value, float(low), float(high), len(by_seed(curves)), kind)
 
@@ -90,10 +90,10 @@ def reach_by_seed(curves: pd.DataFrame, target: float, window: int = LAST) -> Re
     return Reach(epochs, median, float(reached.mean()), float(values.mean()))
 
 
-def transient(baseline: pd.DataFrame, share: float = 0.95) -> int:
+def transient(reference: pd.DataFrame, share: float = 0.95) -> int:
     """Return the last epoch of the transient: the first at which the mean curve has made this share of its rise."""
-    mean = baseline.mean().to_numpy()
-    goal = mean[0] + share * (float(final(baseline).mean()) - mean[0])
+    mean = reference.mean().to_numpy()
+    goal = mean[0] + share * (float(final(reference).mean()) - mean[0])
     epoch = float(first_reach(mean, goal))
     return int(min(max(epoch, 2), len(mean)))
 

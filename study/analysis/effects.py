@@ -84,9 +84,9 @@ def planned(grid: Grid) -> list[tuple[Point, Point]]:
         for fraction in fractions
         for first, second in itertools.combinations(heads, 2)
     ]
-    if len(fractions) > 1 and grid.baseline in heads:
-        top = (grid.baseline, fractions[0])
-        contrasts += [((name, fractions[-1]), top) for name in heads if name != grid.baseline]
+    if len(fractions) > 1 and grid.reference in heads:
+        top = (grid.reference, fractions[0])
+        contrasts += [((name, fractions[-1]), top) for name in heads if name != grid.reference]
     return contrasts
 
 

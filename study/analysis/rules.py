@@ -130,7 +130,7 @@ def _above(evidence: Evidence, metric: str, pair: Pair, findings: int) -> Findin
 
 
 def _find_good_steering(evidence: Evidence, pairs: Sequence[Pair]) -> list[Finding]:
-    """Return findings that each cell's loss is below the bound; beside them whether it equals the baseline's."""
+    """Return findings that each cell's loss is below the bound; beside them whether it equals the reference's."""
     rules, points = evidence.rules, list(dict.fromkeys(point for pair in pairs for point in pair))
     bound, findings = rules.steering_good * evidence.floor, []
     for point in sorted(points, key=effects.points(evidence.grid).index):
@@ -170,7 +170,7 @@ def _find_reach(evidence: Evidence, pairs: Sequence[Pair]) -> list[Finding]:
         bound = (REACH.get(point[1], REACH[1.0]) + rules.reach_slack) * curves.shape[1]
         difference, allowance = evidence.difference(ACCURACY, pair), evidence.allowance(pair)
         epoch = convergence.epochs_to_reach(curves, base, difference)
-        # The baseline itself, even were its encoder better by the allowance, must be slower: else speed shows nothing.
+        # The reference itself, even were its encoder better by the allowance, must be slower: else speed shows nothing.
         slower = convergence.epochs_to_reach(base, base).low > epoch.high
         distinct = epoch.high <= bound and slower and goal - mean[int(epoch.high) - 1] > allowance
         behind = float(curves.mean().iloc[: max(int(bound), 1)].max()) + allowance < goal

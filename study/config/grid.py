@@ -60,7 +60,7 @@ class Rules(Settings):
         0.1, description="steering is good below this loss, as a share of the best constant command's"
     )
     steering_margin: NotNegative = Field(
-        0.25, description="largest difference in steering loss that is none, as a share of the baseline's own loss"
+        0.25, description="largest difference in steering loss that is none, as a share of the reference's own loss"
     )
     steering_allowance: NotNegative = Field(
         0.17, description="what two encoders may differ in steering loss by their seeds alone, as a share of it"
@@ -106,7 +106,7 @@ class Grid(Settings):
     )
     encoder_seeds: Count = Field(1, description="encoders for each head set and fraction")
     policy_seeds: Count = Field(15, description="policies on each encoder (Sec. V-A: 15)")
-    baseline: str = Field("rec", description="head set that the others are compared with")
+    reference: str = Field("rec", description="head set that the others are compared with")
     baselines: tuple[str, ...] = Field(
         tuple(BASELINES), description="cells without a head set to compare with (docs/reading-a-report.md); [] for none"
     )
@@ -117,7 +117,7 @@ class Grid(Settings):
     @model_validator(mode="after")
     def _known(self) -> Self:
         load_heads(self.head_modules)
-        for heads in (*self.heads, self.baseline):
+        for heads in (*self.heads, self.reference):
             if heads not in HEAD_SETS:
                 raise ValueError(f"unknown head set '{heads}'; choose from {', '.join(HEAD_SETS)}")
         try:

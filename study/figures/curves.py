@@ -59,27 +59,27 @@ def compare_heads(
 @mpl.rc_context(STYLE)
 def converge_speed(
     accuracy: pd.DataFrame,
-    baseline: str,
+    reference: str,
     reached: Mapping[float, float],
     accuracy_floor: float,
     baselines: pd.DataFrame | None = None,
 ) -> Figure:
-    """Draw test accuracy by epoch: full at every fraction, the baseline at the largest (fig:datasize_convergespeed).
+    """Draw test accuracy by epoch: full at every fraction, the reference at the largest (fig:datasize_convergespeed).
 
     `accuracy`, `baselines`: `analysis.intervals.curve_bands`; `reached`: fraction -> epoch at which full's mean curve
-    reaches the baseline's final accuracy, infinite when never.
+    reaches the reference's final accuracy, infinite when never.
     """
     figure, (axes,) = new_figure(3.4)
     top = accuracy["fraction"].max()
-    base = accuracy[(accuracy["heads"] == baseline) & (accuracy["fraction"] == top)]
+    base = accuracy[(accuracy["heads"] == reference) & (accuracy["fraction"] == top)]
     others = accuracy[accuracy["heads"] == "full"]
     ends, colours = [], {}
     for index, (fraction, rows) in enumerate(others.groupby("fraction", sort=False)):
         colour, marker = (marks[index % len(marks)] for marks in (FRACTION_COLOUR, FRACTION_MARKER))
         ends.append(_curve(axes, rows, 100.0, f"full, {_percent(fraction)}", colour, "-", marker, index))
         colours[float(str(fraction))] = colour
-    heads = look(baseline)
-    ends.append(_curve(axes, base, 100.0, f"{baseline}, {_percent(top)}", heads.colour, "--", heads.marker, 0))
+    heads = look(reference)
+    ends.append(_curve(axes, base, 100.0, f"{reference}, {_percent(top)}", heads.colour, "--", heads.marker, 0))
     _accuracy_axis(axes, pd.concat([others, base]), accuracy_floor, baselines)
     goal = 100 * float(base["mean"].iloc[-5:].mean())
     axes.axhline(goal, color=GREY, linewidth=0.6, linestyle=":")

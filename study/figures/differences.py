@@ -103,7 +103,7 @@ Range = tuple[float, float, float]  # a value and the ends of its interval, as s
 
 @dataclass(frozen=True)
 class TwoSided:
-    """A head set and fraction on two sides: None where a side has none, or no difference, as the baseline."""
+    """A head set and fraction on two sides: None where a side has none, or no difference, as the reference."""
 
     label: str
     heads: str
@@ -127,7 +127,7 @@ def both_values(rows: Sequence[TwoSided], names: tuple[str, str]) -> Figure:
 
 @mpl.rc_context(STYLE)
 def two_sweeps(rows: Sequence[TwoSided], names: tuple[str, str], baselines: tuple[str, str], note: str) -> Figure:
-    """Draw the final accuracy [%] of two sweeps, row by row, beside the differences to each one's baseline [points].
+    """Draw the final accuracy [%] of two sweeps, row by row, beside the differences to each one's reference [points].
 
     `names`: what the key says of each sweep; `note`: a line below. Bars are the intervals given. Without any difference
     there is one panel.

@@ -44,7 +44,7 @@ def report(name: str, profile: str | None, kind: str, out: Path, tracking: str) 
     "--figure",
     type=Path,
     metavar="FILE",
-    help="draw accuracy and differences to the baseline of both sweeps into FILE (.svg, .png or .pdf); the Markdown "
+    help="draw accuracy and differences to the reference of both sweeps into FILE (.svg, .png or .pdf); the Markdown "
     "shows it by its path from the working folder",
 )
 @tracking_option()

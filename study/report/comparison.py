@@ -35,7 +35,7 @@ def compare(first: Report, second: Report, names: tuple[str, str], picture: str 
     both = [point for point in cells if all(point in side.by_point for side in sides)]
     differing, same = _differing(sides)
     bars: list[Spread | Estimate] = [row.accuracy for side in sides for row in side.scores]
-    bars += [gain for side in sides for point in cells if (gain := side.above_baseline(point))]
+    bars += [gain for side in sides for point in cells if (gain := side.above_reference(point))]
     return render(
         "comparison.md.jinja",
         {"two_sweeps": picture} if picture else {},

@@ -68,7 +68,7 @@ def _speed(record: SweepRecord, report: Report) -> Drawing | None:
     if not reached:
         return None
     bands = intervals.curve_bands(record.table(), ACCURACY)
-    return curves.converge_speed(bands, report.sweep.baseline, reached, report.floor[ACCURACY], _baselines(record))
+    return curves.converge_speed(bands, report.sweep.reference, reached, report.floor[ACCURACY], _baselines(record))
 
 
 def _fractions(report: Report) -> Drawing:
@@ -217,7 +217,7 @@ def _side_by_side(samples_of: dict[str, Arrays]) -> Rows:
 
 
 def draw_sweeps(first: Report, second: Report, names: tuple[str, str]) -> Drawing:
-    """Return final accuracy, and differences to the baseline, of two sweeps; `names` say where each comes from.
+    """Return final accuracy, and differences to the reference, of two sweeps; `names` say where each comes from.
 
     Raises BadInputError when neither has a finished cell.
     """
@@ -229,7 +229,7 @@ def draw_sweeps(first: Report, second: Report, names: tuple[str, str]) -> Drawin
         scores = [side.by_point[point].accuracy if point in side.by_point else None for side in sides]
         ranges = tuple((row.mean, row.low, row.high) if row else None for row in scores)
         rows.append(
-            differences.TwoSided(label, *point, ranges, tuple(_range(side.above_baseline(point)) for side in sides))
+            differences.TwoSided(label, *point, ranges, tuple(_range(side.above_reference(point)) for side in sides))
         )
     keys = (side_key("first", first, names[0]), side_key("second", second, names[1]))
-    return differences.two_sweeps(rows, keys, (first.sweep.baseline, second.sweep.baseline), ends_text(first, second))
+    return differences.two_sweeps(rows, keys, (first.sweep.reference, second.sweep.reference), ends_text(first, second))

@@ -49,7 +49,7 @@ class Sweep(Part):
     encoder_seeds: int
     policy_seeds: int
     policy_epochs: int
-    baseline: str
+    reference: str
     heads: tuple[str, ...]
     fractions: tuple[float, ...]
     planned: int
@@ -127,7 +127,7 @@ class Score(Part):
 
 
 class Convergence(Part):
-    """How fast a cell reaches the baseline's final accuracy."""
+    """How fast a cell reaches the reference's final accuracy."""
 
     cell: str
     fraction: float
@@ -283,9 +283,9 @@ class Report(Part):
         """Return the contrasts in acceleration accuracy."""
         return [row for row in self.comparisons if row.metric == learning_curves.ACCURACY]
 
-    def above_baseline(self, point: Point) -> Estimate | None:
-        """Return the difference in accuracy of a head set to the baseline at the same fraction."""
-        base = (self.sweep.baseline, point[1])
+    def above_reference(self, point: Point) -> Estimate | None:
+        """Return the difference in accuracy of a head set to the reference at the same fraction."""
+        base = (self.sweep.reference, point[1])
         for row in self.accuracy_contrasts:
             if point != base and {row.first, row.second} == {point, base}:
                 gain: Estimate = row.difference

@@ -60,7 +60,7 @@ def summarise(record: SweepRecord) -> Report:
     panels = {name: learning_curves.panel(record.table(), name) for name in (ACCURACY, STEERING)}
     accuracy = panels[ACCURACY]
     finished = {point: accuracy[point] for point in effects.points(grid) if point in accuracy}
-    reference = (grid.baseline, max(grid.fractions))
+    reference = (grid.reference, max(grid.fractions))
     base, cells = accuracy.get(reference), effects.samples(accuracy, effects.drive_scores(record, ACCURACY, accuracy))
     floor, counts = _floor(record), parameter_counts()
     beside, ends = _baselines(record)
@@ -107,7 +107,7 @@ def _sweep(record: SweepRecord, design: Literal["A", "B"]) -> Sweep:
     missing = {key: cell.label for key, cell in record.planned.items() if key not in record.results}
     reasons = {key: record.failed[key].strip() for key in missing if key in record.failed}
     return Sweep(
-        **grid.model_dump(include={"name", "title", "encoder_seeds", "policy_seeds", "baseline"}),
+        **grid.model_dump(include={"name", "title", "encoder_seeds", "policy_seeds", "reference"}),
         simulator=f"imported drives, written by {', '.join(writers)}" if writers else SIMULATOR,
         imported=bool(writers),
         profile=record.profile,
