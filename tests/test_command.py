@@ -26,7 +26,7 @@ def folder(tmp_path_factory):
     ("words", "expected"),
     [
         (["heds"], "choose from datasize, datasize-budget-steps"),
-        (["heads", "--profile", "desktop"], "choose from laptop, paper, smoke, tiny"),
+        (["heads", "--profile", "huge"], "choose from desktop, laptop, paper, smoke, tiny"),
         (["heads", "--encoder.epohcs", "5"], "--encoder.epochs"),
         (["heads", "--encoder.epochs", "five"], "encoder.epochs"),
         (["heads", "--heads", "[rec,rec+plam]"], "choose from rec, rec+pred, rec+plan, full"),
