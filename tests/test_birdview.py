@@ -363,4 +363,4 @@ def test_the_pixels_are_those_of_the_format_version():
     episode = crossing_drive(0)
     images, masks = Renderer(episode, SETTINGS).render(valid_moments(episode, SETTINGS)[::50])
     digest = hashlib.sha256(images.tobytes() + masks.tobytes()).hexdigest()[:16]
-    assert (FORMAT_VERSIONS["frames"], digest) == (2, "81fef599fc2b0e89")
+    assert (FORMAT_VERSIONS["frames"], digest) == (3, "81fef599fc2b0e89")

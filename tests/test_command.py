@@ -8,6 +8,7 @@ import time
 
 import pytest
 
+from study.config.baselines import BASELINES
 from study.console.interrupts import STOP_SECONDS, check_stopped, stoppable
 from study.errors import EXIT_AGAIN, EXIT_INTERRUPTED
 from tests.support.processes import sweep
@@ -73,7 +74,7 @@ def test_dry_run_speaks_json(folder):
     assert [(cell["heads"], cell["encoder_seed"], cell["status"]) for cell in facts["cells"]] == [
         ("full", 0, "waiting"),
         ("full", 1, "waiting"),
-        ("state", 0, "waiting"),
+        *((name, seed, "waiting") for name, record in BASELINES.items() for seed in range(record.seeds)),
     ]
     assert facts["seconds"] > 0 < facts["bytes"]
 

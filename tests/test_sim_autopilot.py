@@ -76,7 +76,8 @@ def test_the_limit_is_kept_and_cars_come_near_it(town: Drive) -> None:
     assert limit - 0.5 < town.speed.max() < limit + 0.3
 
 
-def test_a_brake_is_held_for_half_a_second(town: Drive) -> None:
+def test_a_brake_is_held_for_as_long_as_it_should() -> None:
+    town = drive(0, 300, brake_hold=0.5, vehicles=40)
     brakes = (town.acceleration == -1).astype(int)
     for column in brakes.T:
         edges = np.diff(column)

@@ -144,7 +144,10 @@ def test_vehicles_near_each_other_are_the_same(both: tuple[Traffic, Traffic]) ->
 
 
 def test_drives_with_highway_envs_own_look_ups_are_equal_bit_for_bit() -> None:
-    settings, dynamics = TownSettings(vehicles=20, per_drive=True), DynamicsSettings(lag=0.3, wheel_lag=0.1)
+    settings, dynamics = (
+        TownSettings(vehicles=20, per_drive=True, road_limits=()),
+        DynamicsSettings(lag=0.3, wheel_lag=0.1),
+    )
     fast, stock = (make_traffic(settings, 3, dynamics, fast=fast) for fast in (True, False))
     for step in range(60):
         for road in (fast, stock):

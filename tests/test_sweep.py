@@ -15,7 +15,7 @@ from tests.support.run_database import run_database
 from tests.support.sweeps import FOUR_CELLS, TINY_SWEEP, working_folder
 
 SMOKE = ("--profile", "smoke", "--threads", "1")
-SMALL = (*SMOKE, "--policy_seeds", "3")
+SMALL = (*SMOKE, "--policy_seeds", "3", "--baselines", "[state]")
 TWO = ("--heads", "[rec,full]")
 
 

@@ -43,12 +43,20 @@ def supervised_latents(inputs: BaselineInputs) -> Z:
     return encode(weights, frames.images, np.arange(len(frames)), device=inputs.device)
 
 
-def _head(widths: tuple[int, ...]) -> nn.Sequential:
-    """Return fully connected layers with ReLU and dropout after all but the last (Sec. IV-C)."""
-    layers: list[nn.Module] = []
-    for before, after in itertools.pairwise(widths):
-        layers += [nn.Linear(before, after), nn.ReLU(), nn.Dropout(DROPOUT)]
-    return nn.Sequential(*layers[:-2])
+class _Head(nn.Module):
+    """Fully connected layers with ReLU and dropout after all but the last (Sec. IV-C)."""
+
+    def __init__(self, *widths: int) -> None:
+        super().__init__()
+        self.layers = nn.ModuleList(nn.Linear(*pair) for pair in itertools.pairwise(widths))
+
+    def forward(self, z: Tensor, generator: torch.Generator) -> Tensor:
+        *hidden, last = self.layers
+        for layer in hidden:
+            z = layer(z).relu()
+            z = z * (torch.rand(z.shape, generator=generator, device=z.device) >= DROPOUT) / (1 - DROPOUT)
+        output: Tensor = last(z)
+        return output
 
 
 class _Supervised(lightning.LightningModule):
@@ -67,8 +75,8 @@ class _Supervised(lightning.LightningModule):
         self.encoder = untrained_encoder(inputs.seed)
         self.heads = nn.ModuleDict(
             {
-                "steering": _head((LATENT, *STEERING_HIDDEN, 1)),
-                "acceleration": _head((LATENT, *ACCELERATION_HIDDEN, len(ACCELERATIONS))),
+                "steering": _Head(LATENT, *STEERING_HIDDEN, 1),
+                "acceleration": _Head(LATENT, *ACCELERATION_HIDDEN, len(ACCELERATIONS)),
             }
         )
         initialise(self.heads, seeded_generator(inputs.seed, "supervised heads"))
@@ -77,16 +85,16 @@ class _Supervised(lightning.LightningModule):
         return torch.optim.Adam(self.parameters(), lr=self.lr, fused=True)
 
     def on_train_epoch_start(self) -> None:
-        generator = rng(self.inputs.seed, f"supervised epoch {self.current_epoch}")
-        self.parts = np.array_split(generator.permutation(self.train_rows), self.batches)
-        torch.manual_seed(int(generator.integers(2**63)))  # of dropout, which takes no generator
+        seed, purpose = self.inputs.seed, f"supervised epoch {self.current_epoch}"
+        self.parts = np.array_split(rng(seed, purpose).permutation(self.train_rows), self.batches)
+        self.dropout = seeded_generator(seed, f"{purpose} dropout", self.device)
 
     def training_step(self, batch: int) -> None:
         rows = np.sort(self.parts[batch])
         steering, acceleration = (values[rows].to(self.device) for values in self.commands)
         z = self.encoder(to_float(torch.from_numpy(self.frames.images[rows]).to(self.device)))
-        loss: Tensor = functional.smooth_l1_loss(self.heads["steering"](z).squeeze(1), steering)
-        loss = loss + functional.cross_entropy(self.heads["acceleration"](z), acceleration)
+        loss: Tensor = functional.smooth_l1_loss(self.heads["steering"](z, self.dropout).squeeze(1), steering)
+        loss = loss + functional.cross_entropy(self.heads["acceleration"](z, self.dropout), acceleration)
         optimizer = self.optimizers(use_pl_optimizer=False)
         assert isinstance(optimizer, torch.optim.Optimizer)
         optimizer.zero_grad()
