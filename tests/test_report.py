@@ -153,7 +153,7 @@ def test_a_report_says_when_its_rules_are_younger_than_its_cells(date, younger):
     rules = Rules.model_validate({"fixed": {"date": date, "commit": "ab" * 20}})
     record = simulate(SMALL.model_copy(update={"rules": rules}), World(epochs=6))  # of cells begun on 2026-05-01
     text = markdown(document(summarise(record)))
-    assert f"Rules of {date}, commit `ababababab`; cells computed from 2026-05-01 to 2026-05-01" in text
+    assert f"Rules of {date}, commit `ababababab`; cells computed on 2026-05-01" in text
     assert ("The rules were changed after cells of this sweep were computed" in text) == younger
 
 

@@ -34,10 +34,9 @@ def supervised_latents(inputs: BaselineInputs) -> Z:
     if device.type == "cpu":
         keep_memory()
     network = _Supervised(frames, settings.lr, inputs)
-    train = frames.indices("train")
-    batch = min(settings.batch, len(train))
+    batch = min(settings.batch, len(network.train_rows))
     with trainer(device, SUPERVISED_EPOCHS, f"batch {batch}", "lower --encoder.batch") as lightning_trainer:
-        network.batches = math.ceil(len(train) / batch)
+        network.batches = math.ceil(len(network.train_rows) / batch)
         lightning_trainer.fit(network, train_dataloaders=range(network.batches))
     weights = {name: value.numpy(force=True) for name, value in network.encoder.state_dict().items()}
     return encode(weights, frames.images, np.arange(len(frames)), device=inputs.device)
@@ -66,7 +65,8 @@ class _Supervised(lightning.LightningModule):
         super().__init__()
         self.automatic_optimization = False
         self.lr, self.inputs, self.batches = lr, inputs, 0
-        self.frames, self.train_rows = frames, frames.indices("train")
+        self.frames = frames
+        self.train_rows = frames.subset(inputs.settings.policy.share, "frame", inputs.settings.frames.seed)
         labels = frames.labels
         self.commands = (
             torch.tensor(labels["steering"].to_numpy(np.float32)),

@@ -66,7 +66,7 @@ def frames_key(settings: StudySettings, source: str | None = None) -> str:
 def encoder_key(settings: StudySettings, cell: Cell, frames: str) -> str:
     """Key of a trained encoder, or of a baseline. What makes no difference at the full data is left out there."""
     if cell.baseline:
-        training = settings.encoder.model_dump(mode="json", include={"batch", "lr"})
+        training = settings.encoder.model_dump(mode="json", include={"batch", "lr"}) | {"share": settings.policy.share}
         named = {"name": cell.heads, "seed": cell.encoder_seed} | (training if cell.heads == SUPERVISED else {})
         return content_key("baseline", named, (frames,), FORMAT_VERSIONS["baseline"])
     parts: dict[str, Any] = {

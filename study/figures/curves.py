@@ -37,7 +37,7 @@ def compare_heads(
     over seeds, darker band for the 95 % interval of the mean. `baselines`: for each metric the bands of baselines, of
     which the mean is drawn.
     """
-    figure, panels = new_figure(3.0, columns=2)
+    figure, panels = new_figure(2.7, columns=2)
     for axes, bands, scale in zip(panels, (steering, accuracy), (1000.0, 100.0), strict=True):
         ends = []
         for index, (name, rows) in enumerate(bands.groupby("heads", sort=False)):
@@ -238,7 +238,7 @@ def compare_fractions(
     mean, sd, low, high. Thin bar: one standard deviation over seeds; thick bar: 95 % interval of the mean. `baselines`:
     rows with metric, heads and mean, drawn as lines, since they do not depend on the fraction.
     """
-    figure, panels = new_figure(3.0, columns=2)
+    figure, panels = new_figure(2.7, columns=2)
     metrics = (STEERING, ACCURACY)
     for axes, metric, scale in zip(panels, metrics, (1000.0, 100.0), strict=True):
         shown, ends = scores[scores["metric"] == metric], []

@@ -51,12 +51,13 @@ def experiment_tags(experiment: str, existing: Mapping[str, str]) -> dict[str, s
 
 
 def cell_tags(cell: Cell, policy_seeds: int) -> dict[str, str]:
-    """Return a cell run's description, and the colour of its head set in the figures."""
-    head_set = HEAD_SETS.get(cell.heads)
-    training = f"{policy_seeds} policies on the true state, without encoder"
-    if head_set is not None:
+    """Return a cell run's description, and the colour of its head set or baseline in the figures."""
+    shown = HEAD_SETS.get(cell.heads) or cell.baseline
+    if cell.baseline:
+        training = f"{policy_seeds} policies that are given {cell.baseline.about}"
+    else:
         training = (
-            f"An encoder trained with the heads {' + '.join(head_set.heads)} on {cell.fraction * 100:g} % of the data "
+            f"An encoder trained with the heads {cell.heads} on {cell.fraction * 100:g} % of the data "
             f"(encoder seed {cell.encoder_seed}), and {policy_seeds} policies on its frozen latent; model `driver` is "
             "all of them as one network"
         )
@@ -65,4 +66,4 @@ def cell_tags(cell: Cell, policy_seeds: int) -> dict[str, str]:
         "deviation and the 95 % interval of that mean. `final/...` is the mean of the last five epochs on test "
         "frames, `floor` the accuracy of always saying the commonest class."
     )
-    return {NOTE: note, **({COLOUR: head_set.colour} if head_set else {})}
+    return {NOTE: note, **({COLOUR: shown.colour} if shown else {})}
