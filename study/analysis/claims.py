@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 from study.analysis import effects, learning_curves, predictions
 from study.analysis.effects import label, results_at
@@ -41,14 +41,7 @@ Outcome = Literal[
     "not tested at this scale",
     "not tested",
 ]
-OUTCOMES: tuple[Outcome, ...] = (
-    "reproduced",
-    "not reproduced",
-    "inconclusive",
-    "cannot be tested at this size",
-    "not tested at this scale",
-    "not tested",
-)
+OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)
 
 
 @dataclass(frozen=True)

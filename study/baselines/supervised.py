@@ -19,7 +19,6 @@ from study.baselines.inputs import BaselineInputs, Z
 from study.compute.device import check_device, keep_memory
 from study.compute.trainer import trainer
 from study.config.paper import ACCELERATION_HIDDEN, ACCELERATIONS, DROPOUT, LATENT, STEERING_HIDDEN
-from study.data.frames import Frames
 from study.encoder.inputs import to_float
 from study.encoder.latents import encode
 from study.encoder.networks import initialise, seeded_generator, untrained_encoder
@@ -30,16 +29,15 @@ from study.stages import SUPERVISED_EPOCHS
 
 def supervised_latents(inputs: BaselineInputs) -> Z:
     """Return the latents of the trained network. Raises TrainingDivergedError for a loss that is not finite."""
-    device, frames, settings = check_device(inputs.device), inputs.store.policy, inputs.settings.encoder
+    device, images = check_device(inputs.device), inputs.store.policy.images
     if device.type == "cpu":
         keep_memory()
-    network = _Supervised(frames, settings.lr, inputs)
-    batch = min(settings.batch, len(network.train_rows))
-    with trainer(device, SUPERVISED_EPOCHS, f"batch {batch}", "lower --encoder.batch") as lightning_trainer:
-        network.batches = math.ceil(len(network.train_rows) / batch)
+    network = _Supervised(inputs)
+    load = f"batch {inputs.settings.encoder.batch}"
+    with trainer(device, SUPERVISED_EPOCHS, load, "lower --encoder.batch") as lightning_trainer:
         lightning_trainer.fit(network, train_dataloaders=range(network.batches))
     weights = {name: value.numpy(force=True) for name, value in network.encoder.state_dict().items()}
-    return encode(weights, frames.images, np.arange(len(frames)), device=inputs.device)
+    return encode(weights, images, np.arange(len(images)), device=inputs.device)
 
 
 class _Head(nn.Module):
@@ -61,13 +59,13 @@ class _Head(nn.Module):
 class _Supervised(lightning.LightningModule):
     """The encoder, and on its latent both policy networks, with the policies' loss."""
 
-    def __init__(self, frames: Frames, lr: float, inputs: BaselineInputs) -> None:
+    def __init__(self, inputs: BaselineInputs) -> None:
         super().__init__()
         self.automatic_optimization = False
-        self.lr, self.inputs, self.batches = lr, inputs, 0
-        self.frames = frames
-        self.train_rows = frames.subset(inputs.settings.policy.share, "frame", inputs.settings.frames.seed)
-        labels = frames.labels
+        self.inputs, self.images = inputs, inputs.store.policy.images
+        settings, labels = inputs.settings, inputs.store.policy.labels
+        self.train_rows = inputs.store.policy.subset(settings.policy.share, "frame", settings.frames.seed)
+        self.batches = math.ceil(len(self.train_rows) / settings.encoder.batch)
         self.commands = (
             torch.tensor(labels["steering"].to_numpy(np.float32)),
             torch.tensor(labels["acceleration"].to_numpy(np.int64)),
@@ -82,7 +80,7 @@ class _Supervised(lightning.LightningModule):
         initialise(self.heads, seeded_generator(inputs.seed, "supervised heads"))
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
-        return torch.optim.Adam(self.parameters(), lr=self.lr, fused=True)
+        return torch.optim.Adam(self.parameters(), lr=self.inputs.settings.encoder.lr, fused=True)
 
     def on_train_epoch_start(self) -> None:
         seed, purpose = self.inputs.seed, f"supervised epoch {self.current_epoch}"
@@ -92,7 +90,7 @@ class _Supervised(lightning.LightningModule):
     def training_step(self, batch: int) -> None:
         rows = np.sort(self.parts[batch])
         steering, acceleration = (values[rows].to(self.device) for values in self.commands)
-        z = self.encoder(to_float(torch.from_numpy(self.frames.images[rows]).to(self.device)))
+        z = self.encoder(to_float(torch.from_numpy(self.images[rows]).to(self.device)))
         loss: Tensor = functional.smooth_l1_loss(self.heads["steering"](z, self.dropout).squeeze(1), steering)
         loss = loss + functional.cross_entropy(self.heads["acceleration"](z, self.dropout), acceleration)
         optimizer = self.optimizers(use_pl_optimizer=False)

@@ -31,8 +31,8 @@ class CellResult:
     A baseline has neither an encoder nor samples nor curves of an encoder.
 
     `curves`: one row per measured point, columns CURVE_COLUMNS; stage "encoder" (metrics loss, loss_rec, loss_pred,
-    loss_plan, loss_kl; policy_seed is NO_SEED) or "policy" (the metrics of
-    `study.policy.metrics`); split "train" or "test"; epoch counts from 1.
+    loss_plan, loss_kl; policy_seed is NO_SEED) or "policy" (the metrics of `study.policy.metrics`); split "train" or
+    "test"; epoch counts from 1.
     `encoder`, `policies`: weights by name; those of the policies have a leading axis S, beside `z_mean`, `z_std` [64].
     `samples`: test frames of the encoder set: `input` [K, 64, 64, 3] uint8, and for each head `<head>_output` uint8
     ([K, 64, 64, 3] for rec, [K, 64, 64] else, 255 is one) and `<head>_target` for pred and plan.

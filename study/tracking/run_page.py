@@ -52,12 +52,14 @@ def experiment_tags(experiment: str, existing: Mapping[str, str]) -> dict[str, s
 
 def cell_tags(cell: Cell, policy_seeds: int) -> dict[str, str]:
     """Return a cell run's description, and the colour of its head set or baseline in the figures."""
-    shown = HEAD_SETS.get(cell.heads) or cell.baseline
+    head_set = HEAD_SETS.get(cell.heads)
+    shown = head_set or cell.baseline
     if cell.baseline:
         training = f"{policy_seeds} policies that are given {cell.baseline.about}"
     else:
+        heads = " + ".join(head_set.heads) if head_set else cell.heads
         training = (
-            f"An encoder trained with the heads {cell.heads} on {cell.fraction * 100:g} % of the data "
+            f"An encoder trained with the heads {heads} on {cell.fraction * 100:g} % of the data "
             f"(encoder seed {cell.encoder_seed}), and {policy_seeds} policies on its frozen latent; model `driver` is "
             "all of them as one network"
         )
