@@ -41,7 +41,7 @@ Log = Callable[[int, dict[str, float]], None]
 Progress = Callable[[int, int], None]
 CHECKPOINT_SECONDS = 60.0  # between two checkpoints of 23 MB: what a kill costs at most
 PROGRESS_SECONDS = 0.25
-FUSED_STEPS = 10_000  # compiling takes about a minute: it must be worth it
+FUSED_IMAGES = 10_000_000  # compiling takes about a minute: it must be worth it
 SPARE_BYTES = 1 << 30  # of a GPU's memory, for the libraries' work space and for gaps
 
 
@@ -137,7 +137,7 @@ def train_encoder(
             keep_memory()
         else:
             module.to(memory_format=torch.channels_last)
-            if epochs * plan.steps >= FUSED_STEPS:
+            if epochs * plan.frames_an_epoch >= FUSED_IMAGES:
                 module.fuse()
         data = TrainingData(resident(frames, target, room), plan, state, target)
         with trainer(
