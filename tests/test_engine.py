@@ -16,11 +16,13 @@ import psutil
 import pytest
 import yaml
 
+from study.compute import gpus
+from study.compute.gpus import visible_gpus
 from study.engine import cluster, dask_engine, local
 from study.engine.cluster import cluster_engine, start_jobs
 from study.engine.cluster_options import check_address
 from study.engine.flows import TRIES, run_flow
-from study.engine.local import local_engine, visible_gpus
+from study.engine.local import local_engine
 from study.errors import BadInputError
 from study.stages import ENCODER, Batch, Task
 from tests.support.listeners import run_and_record
@@ -296,7 +298,7 @@ def test_jobs_of_a_batch_system_work_over_tls(tmp_path, monkeypatch):
 def test_gpus_are_named_as_cuda_names_them(monkeypatch, visible, count, device, names):
     """What CUDA would count is given: there may be no GPU here."""
     monkeypatch.setattr("torch.cuda.device_count", lambda: count)
-    monkeypatch.setattr(local, "GPU_DRIVERS", ("/dev/null",) if count else ())
+    monkeypatch.setattr(gpus, "GPU_DRIVERS", ("/dev/null",) if count else ())
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     if visible is not None:
         monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)

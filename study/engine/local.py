@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import signal
 from collections.abc import Sequence
 from functools import partial
@@ -13,8 +12,6 @@ from pathlib import Path
 from distributed import Client, Nanny, Scheduler, SpecCluster
 
 from study.engine.dask_engine import GPU, DaskEngine, configure_dask
-
-GPU_DRIVERS = ("/dev/nvidiactl", "/dev/kfd", "/dev/dxg")  # of CUDA, ROCm, and either in WSL
 
 
 def local_engine(workers: int, scratch: Path, gpus: Sequence[str] = ()) -> DaskEngine:
@@ -53,17 +50,3 @@ def local_engine(workers: int, scratch: Path, gpus: Sequence[str] = ()) -> DaskE
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
     # A worker that does not come back in time is given up by Dask, and started anew when the cluster is scaled again.
     return DaskEngine(client, cluster.scheduler_address, cluster, partial(cluster.scale, len(kinds)))
-
-
-def visible_gpus(device: str) -> list[str]:
-    """Return CUDA's names of the GPUs that `--device` asks for: all of them for auto and cuda, one for cuda:N."""
-    if device == "cpu" or (device == "auto" and not any(Path(file).exists() for file in GPU_DRIVERS)):
-        return []
-    import torch  # noqa: PLC0415 - takes seconds that a CPU run can do without
-
-    names = os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")
-    count = torch.cuda.device_count()
-    visible = names[:count] if len(names) >= count and names != [""] else [str(number) for number in range(count)]
-    if device.startswith("cuda:"):
-        return visible[int(device.removeprefix("cuda:")) :][:1]
-    return visible

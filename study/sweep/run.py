@@ -14,6 +14,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
+from study.compute.gpus import visible_gpus
 from study.compute.provenance import cores, provenance
 from study.config.workspace import Workspace
 from study.data.card import card_files, source_drives
@@ -23,7 +24,7 @@ from study.engine.cluster import cluster_engine
 from study.engine.dask_engine import DaskEngine
 from study.engine.flows import run_flow, run_flows
 from study.engine.inline import InlineEngine
-from study.engine.local import local_engine, visible_gpus
+from study.engine.local import local_engine
 from study.engine.tasks import Engine
 from study.errors import EXIT_FAILED, BadInputError, masked
 from study.report.build import publish

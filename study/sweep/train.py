@@ -21,6 +21,7 @@ from filelock import FileLock, Timeout
 
 from study.cell.flow import cell_flow, product_folders
 from study.cell.job import CellJob
+from study.compute.gpus import visible_gpus
 from study.compute.provenance import cores
 from study.console.display import Display
 from study.data.prepare import data_flow
@@ -46,10 +47,11 @@ def train(plan: Plan, out: Path, device: str, threads: int) -> int:
     if not jobs:
         return 0
     plan.workspace.data.mkdir(exist_ok=True)
-    with plan_display(plan, jobs) as display, _engine(plan, device, threads) as engine:
+    gpus = visible_gpus(device)
+    with plan_display(plan, jobs) as display, _engine(plan, gpus, threads) as engine:
         run_flow(data_flow(plan.settings, plan.workspace.data, plan.imported), engine, display.data)
         shutil.copyfile(plan.frames / "manifest.json", out / f"frames-{plan.frames.name}.json")
-        saving = _Saving(out, jobs, display, one_share=engine.gpus() > 0)
+        saving = _Saving(out, jobs, display, one_share=bool(gpus))
         run_flows(
             engine, saving.next_flow, Listener(saving.finished, saving.failed, display.progress, tick=display.tick)
         )
@@ -60,13 +62,13 @@ def train(plan: Plan, out: Path, device: str, threads: int) -> int:
     return 0 if all((out / key).is_dir() for key in plan.cells) else EXIT_AGAIN
 
 
-def _engine(plan: Plan, device: str, threads: int) -> DaskEngine | InlineEngine:
+def _engine(plan: Plan, gpus: list[str], threads: int) -> DaskEngine | InlineEngine:
     """Use Dask, and with it all cores and GPUs, where it is installed."""
     try:
         local = importlib.import_module("study.engine.local")
     except ModuleNotFoundError:
         return InlineEngine()
-    engine: DaskEngine = local.local_engine(max(1, cores() // threads), plan.workspace.tmp, local.visible_gpus(device))
+    engine: DaskEngine = local.local_engine(max(1, cores() // threads), plan.workspace.tmp, gpus)
     return engine
 
 
