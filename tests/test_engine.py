@@ -18,7 +18,7 @@ import yaml
 
 from study.compute import gpus
 from study.compute.gpus import visible_gpus
-from study.engine import cluster, dask_engine, local
+from study.engine import cluster, dask_engine
 from study.engine.cluster import cluster_engine, start_jobs
 from study.engine.cluster_options import check_address
 from study.engine.flows import TRIES, run_flow
