@@ -98,6 +98,18 @@ def test_labels_at_the_ends_do_not_touch(bands):
     assert min(np.diff(heights)) > 0.05
 
 
+def test_labels_that_have_room_stay_at_their_curves(bands):
+    """Those that crowd at the bottom do not push away the one at the top."""
+    steering, _ = bands
+    names = list(HEAD_SETS)
+    crowd = steering.assign(mean=[0.001 + 0.002 * (name == names[0]) for name in steering["heads"]])
+    figure = curves.compare_heads(crowd, bands[1], 0.004, 0.34)
+    low, high = figure.axes[0].get_ylim()
+    places = {text.get_text(): text.get_position()[1] for text in figure.axes[0].texts}
+    assert places[names[0]] == pytest.approx((3 - low) / (high - low))
+    assert min(places[name] for name in names) >= 0.02
+
+
 def test_a_figure_is_the_same_bytes_each_time(bands, tmp_path):
     for folder in ("one", "two"):
         figure = curves.compare_heads(*bands, steering_floor=0.004, accuracy_floor=0.34)

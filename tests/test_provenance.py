@@ -99,3 +99,14 @@ def test_a_process_counts_the_cores_that_it_was_given():
         assert cores() == provenance()["cores"] == 1
     finally:
         os.sched_setaffinity(0, allowed)
+
+
+def test_of_two_versions_of_a_package_the_imported_one_is_recorded(tmp_path, monkeypatch):
+    """As with PYTHONPATH before the packages of a machine."""
+    for folder, version in (("first", "2.0"), ("second", "1.0")):
+        info = tmp_path / folder / f"some_thing-{version}.dist-info"
+        info.mkdir(parents=True)
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: some_thing\nVersion: {version}\n")
+    monkeypatch.syspath_prepend(tmp_path / "second")
+    monkeypatch.syspath_prepend(tmp_path / "first")
+    assert provenance(tmp_path)["packages"]["some-thing"] == "2.0"

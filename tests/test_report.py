@@ -133,6 +133,22 @@ def test_a_complete_report_has_no_banner_and_names_its_simulator_and_design(buil
     assert "nothing about other encoders" in text
 
 
+def test_a_report_names_the_machines_of_its_cells_where_they_are_not_the_clients():
+    record = simulate(SMALL, World(epochs=6))
+    assert "Cells computed on" not in markdown(document(summarise(record)))
+    origin = {
+        "cpu": "Processor 9",
+        "cores": 16,
+        "platform": "Linux 6",
+        "python": "3.12.3",
+        "packages": {"torch": "2.11"},
+    }
+    there = {"provenance": {**origin, "time": "2026-05-01T00:00:00+00:00"}, "device": "GPU 7"}
+    results = {key: replace(result, facts={**result.facts, **there}) for key, result in record.results.items()}
+    text = markdown(document(summarise(replace(record, results=results))))
+    assert "| Cells computed on | Processor 9, 16 cores, GPU 7; Linux 6; Python 3.12.3, torch 2.11 |" in text
+
+
 @pytest.fixture(scope="module")
 def incomplete(built, tmp_path_factory):
     """Write a report of less into a copy of the folder: cells are missing, and the drives were imported."""

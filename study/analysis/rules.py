@@ -234,7 +234,7 @@ ABOVE = Rule(
         f"the simultaneous interval excludes a gain of {rules.accuracy_margin * 100:.1f} points. {_widened(rules)} The "
         "same differences on keyframes are evidence beside it."
     ),
-    lambda rules: f"A true difference of {100 * rules.effect:g} points",
+    lambda rules: f"A true difference of {100 * rules.effect:g} {'point' if rules.effect == 0.01 else 'points'}",
     _find_above,
 )
 GOOD_STEERING = Rule(

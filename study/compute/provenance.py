@@ -58,9 +58,12 @@ def cores() -> int:
 
 
 def packages() -> dict[str, str]:
-    """Return the version of every installed distribution by name."""
-    versions = ((dist.name, dist.version) for dist in importlib.metadata.distributions())
-    return dict(sorted((name.lower().replace("_", "-"), version) for name, version in versions if name))
+    """Return the version of every installed distribution by name; of several, that which Python imports."""
+    versions: dict[str, str] = {}
+    for dist in importlib.metadata.distributions():  # in the order of the search path
+        if dist.name:
+            versions.setdefault(dist.name.lower().replace("_", "-"), dist.version)
+    return dict(sorted(versions.items()))
 
 
 def cpu_lines(field: str) -> list[str]:

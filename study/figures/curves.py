@@ -19,6 +19,7 @@ from study.config.heads import HeadSet
 from study.figures.style import FRACTION_COLOUR, FRACTION_MARKER, GREY, STYLE, literal, look, new_figure
 
 STEERING, ACCURACY = "steering_loss", "acceleration_accuracy"
+LEADER = {"arrowstyle": "-", "linewidth": 0.5, "shrinkA": 1, "shrinkB": 0, "relpos": (0, 0.5)}  # to a label's left
 LATE = 0.05  # share of the epochs after which the axis of a curve shows everything
 
 
@@ -171,24 +172,31 @@ def _label_ends(axes: Axes, ends: Sequence[End]) -> None:
     ordered = sorted(ends)
     wanted = [(value - low) / (high - low) for value, _, _ in ordered]
     places = list(wanted)
-    for _ in range(100):
+    for _ in range(200):
         for index in range(len(places) - 1):
             lack = gap - (places[index + 1] - places[index])
             if lack > 0:
                 places[index] -= lack / 2
                 places[index + 1] += lack / 2
-    lift = max(0.02 - places[0], 0) + min(1.02 - places[-1], 0) if places else 0
+        places = [min(max(place, 0.02), 1.02) for place in places]
     for (value, text, colour), place in zip(ordered, places, strict=True):
         axes.annotate(
             text,
             (axes.get_xlim()[1], value),
-            (1.05, place + lift),
+            (1.06, place),
             textcoords="axes fraction",
             color=colour,
             va="center",
             fontsize=7,
             annotation_clip=False,
-            arrowprops={"arrowstyle": "-", "color": colour, "linewidth": 0.5, "shrinkA": 1, "shrinkB": 0},
+            arrowprops={
+                "arrowstyle": "-",
+                "color": colour,
+                "linewidth": 0.5,
+                "shrinkA": 1,
+                "shrinkB": 0,
+                "relpos": (0, 0.5),
+            },
         )
 
 

@@ -207,7 +207,7 @@ class Provenance(Part):
     """Where the numbers come from; `cell_commits` has several entries where cells come from different commits.
 
     `cell_times`: when the first and the last cell began, in UTC, of those whose results say so; `undated`: how many do
-    not.
+    not. `computed_on`: the machines of the cells, with Python and torch, where one is not the client's.
     """
 
     commit: str | None
@@ -222,6 +222,7 @@ class Provenance(Part):
     cell_commits: tuple[str, ...]
     cell_times: tuple[str, ...] = ()
     undated: int = 0
+    computed_on: tuple[str, ...] = ()
     command: str
     keys: dict[str, str]
 

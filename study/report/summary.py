@@ -5,8 +5,8 @@ from __future__ import annotations
 import itertools
 import json
 import math
-from collections.abc import Iterator
-from typing import Literal
+from collections.abc import Iterator, Mapping
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -320,6 +320,8 @@ def _provenance(record: SweepRecord) -> Provenance:
     origins = [result.facts.get("provenance", {}) for result in record.results.values()]
     commits = {each.get("commit") for each in origins}
     times = sorted(each["time"] for each in origins if each.get("time"))
+    devices = [result.facts.get("device") for result in record.results.values()]
+    machines = {_machine(each, device) for each, device in zip(origins, devices, strict=True) if each.get("cpu")}
     return Provenance(
         **{name: origin.get(name) for name in ("commit", "dirty", "lock", "python", "platform", "cpu", "cores")},
         diff_lines=len(str(origin.get("diff") or "").splitlines()),
@@ -327,6 +329,15 @@ def _provenance(record: SweepRecord) -> Provenance:
         cell_commits=tuple(sorted(str(commit) for commit in commits if commit)),
         cell_times=(times[0], times[-1]) if times else (),
         undated=len(origins) - len(times),
+        computed_on=tuple(sorted(machines)) if machines - {_machine(origin, "CPU")} else (),
         command=origin.get("command", f"python -m study.sweep {record.grid.name} --profile {record.profile}"),
         keys={cell.label: key for key, cell in record.planned.items()},
     )
+
+
+def _machine(origin: Mapping[str, Any], device: str | None) -> str:
+    """Return what computed, for people: processor, GPU where it has one, system, Python and torch."""
+    gpu = "" if device in {None, "CPU"} else f", {device}"
+    torch = f", torch {version}" if (version := origin.get("packages", {}).get("torch")) else ""
+    where = f"{origin.get('cpu')}, {origin.get('cores')} cores{gpu}; {origin.get('platform')}"
+    return f"{where}; Python {origin.get('python')}{torch}"
