@@ -542,7 +542,6 @@ def main() -> None:
     result["policies"] = {"ratio_to_sequential": worst, **told, **sizes}
     if not options.policies:
         result["seconds"] = round(time.monotonic() - began, 1)
-    result["gpu"] = None  # not measured yet
     show(result)
     if not options.quick:
         RESULT.write_text(json.dumps(result, indent=1) + "\n")
