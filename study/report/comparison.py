@@ -125,6 +125,7 @@ def _facts(report: Report) -> Iterator[tuple[str, str]]:
         yield f"versions {name}", str(version)
     yield "machine platform", str(origin.platform)
     yield "machine cpu", str(origin.cpu)
+    yield "machine of the cells", " and ".join(origin.computed_on) or "the same"
     for name, rule in report.rules.items():
         for part, number in rule.items() if isinstance(rule, dict) else [("", rule)]:
             yield f"rules {name} {part}".strip(), f"{number:g}" if isinstance(number, float) else str(number or "none")
