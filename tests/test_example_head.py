@@ -1,4 +1,4 @@
-"""A fifth head, added without a change to the program, goes from its record to the report."""
+"""A fifth head and a baseline, added without a change to the program, go from their records to the report."""
 
 import json
 import shutil
@@ -37,7 +37,7 @@ def test_a_further_mask_leaves_the_papers_as_they_are() -> None:
 def test_a_sweep_with_the_example_ends_with_its_report(tmp_path: Path) -> None:
     working_folder(tmp_path)
     shutil.copy(ROOT / "examples/light.yaml", tmp_path / "sweeps")
-    words = ("light", "--profile", "tiny", "--policy_seeds", "2", "--baselines", "[]")
+    words = ("light", "--profile", "tiny", "--policy_seeds", "2", "--baselines", "[speed]")
     completed = sweep(tmp_path, *words, "--heads", "[rec,rec+light]", "--workers", "2")
     assert completed.returncode == 0, completed.stderr
     report = [sys.executable, "-m", "study.report", "light"]  # another process knows the head from the store
@@ -50,16 +50,20 @@ def test_a_sweep_with_the_example_ends_with_its_report(tmp_path: Path) -> None:
     text = " ".join(" ".join(page.extract_text() for page in PdfReader(tmp_path / "reports/light.pdf").pages).split())
     assert "rec+light (reconstruction and traffic lights)" in text  # the words of the record
     assert "(light)" in text  # its learnable numbers
+    assert "speed alone, the ego" in text  # a baseline of a module, too
     assert "(pred)," not in text  # not those of heads that this sweep does not train
 
 
 @pytest.mark.parametrize(
     ("modules", "says"),
-    [(["no_such_module"], "no_such_module.* cannot be used"), (["study.errors"], "needs HEADS and HEAD_SETS")],
+    [
+        (["no_such_module"], "no_such_module.* cannot be used"),
+        (["study.errors"], "needs one of HEADS, HEAD_SETS, BASELINES"),
+    ],
 )
 def test_a_module_without_records_is_refused(modules: list[str], says: str) -> None:
     with pytest.raises(BadInputError, match=says):
-        Grid.model_validate({"name": "x", "title": "X", "heads": ["rec"], "head_modules": modules})
+        Grid.model_validate({"name": "x", "title": "X", "heads": ["rec"], "modules": modules})
 
 
 def test_the_program_itself_has_the_papers_heads() -> None:

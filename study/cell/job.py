@@ -18,7 +18,7 @@ class CellJob:
     `frames` is the folder of the frame store and `drives` that of the drives it was made from, `imported` when these
     are not our town's; missing frames are made from them. `scratch` holds checkpoints and the products of finished
     stages. `device` is "auto" or a torch device. Folders are relative to the working folder of the process that runs.
-    `head_modules` name further heads (see `Grid`).
+    `modules` have further heads and baselines (see `Grid`).
     """
 
     cell: Cell
@@ -31,7 +31,7 @@ class CellJob:
     device: str = "auto"
     threads: int = 1
     imported: Imported | None = None
-    head_modules: tuple[str, ...] = ()
+    modules: tuple[str, ...] = ()
 
     @property
     def work(self) -> Work:

@@ -18,8 +18,8 @@ from study.baselines.inputs import BaselineInputs
 from study.cell.job import CellJob
 from study.compute.device import choose_device, describe_determinism, device_name, peak_bytes
 from study.compute.provenance import provenance
-from study.config.heads import load_heads
 from study.config.keys import cell_key
+from study.config.modules import load_modules
 from study.config.paper import LATENT
 from study.config.settings import SPEEDS
 from study.data.frames import FrameStore, open_frames
@@ -182,7 +182,7 @@ def assemble_result(
 
 def _begin(job: CellJob, report: Reporter) -> tuple[FrameStore, str, dict[str, Any]]:
     """Return the frames, made here where they are missing, the device, and facts about what computes."""
-    load_heads(job.head_modules)
+    load_modules(job.modules)
     device = _set_up(job, report)
     seeds = {
         "recording": job.settings.recording.seed,

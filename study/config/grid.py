@@ -7,10 +7,11 @@ import math
 from collections.abc import Iterable
 from typing import Annotated, Any, Self
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import AliasChoices, BeforeValidator, Field, model_validator
 
 from study.config.baselines import BASELINES, Baseline
-from study.config.heads import HEAD_SETS, heads_of, load_heads
+from study.config.heads import HEAD_SETS, heads_of
+from study.config.modules import load_modules
 from study.config.settings import Count, NotNegative, Positive, Settings, Share
 from study.errors import BadInputError
 
@@ -99,7 +100,11 @@ class Grid(Settings):
 
     name: str
     title: str = Field(description="headline of the report")
-    head_modules: tuple[str, ...] = Field((), description="Python modules with further heads and head sets")
+    modules: tuple[str, ...] = Field(
+        (),
+        validation_alias=AliasChoices("modules", "head_modules"),  # as stores of older sweeps have it
+        description="Python modules with further heads, head sets and baselines",
+    )
     heads: Annotated[tuple[str, ...], *OneOrMore] = Field(description="head sets")
     fractions: Annotated[tuple[Fraction, ...], *OneOrMore] = Field(
         (1.0,), description="data fractions in (0, 1] (Sec. V-B)"
@@ -116,7 +121,7 @@ class Grid(Settings):
 
     @model_validator(mode="after")
     def _known(self) -> Self:
-        load_heads(self.head_modules)
+        load_modules(self.modules)
         for heads in (*self.heads, self.reference):
             if heads not in HEAD_SETS:
                 raise ValueError(f"unknown head set '{heads}'; choose from {', '.join(HEAD_SETS)}")

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
-from study.errors import BadInputError, one_of
+from study.errors import one_of
 
 IMAGE_TARGET = "image"
 
@@ -78,24 +76,3 @@ def heads_of(head_sets: Iterable[str]) -> list[str]:
         if head not in HEADS:
             raise one_of("head", head, HEADS)
     return [head for head in HEADS if head in wanted]
-
-
-def load_heads(modules: Iterable[str]) -> None:
-    """Add the records `HEADS` and `HEAD_SETS` of these modules to those here.
-
-    Raises BadInputError when a module cannot be imported or gives a known name another meaning.
-    """
-    for name in modules:
-        try:
-            module = importlib.import_module(name)
-            further: Any = (module.HEADS, HEADS), (module.HEAD_SETS, HEAD_SETS)
-        except (ImportError, AttributeError) as error:
-            raise BadInputError(
-                f"head module '{name}' cannot be used: {error}; it needs HEADS and HEAD_SETS, tuples of records, and "
-                "must be found by Python where the sweep starts and on every worker"
-            ) from error
-        for records, registry in further:
-            for record in records:
-                if registry.setdefault(record.name, record) != record:
-                    raise BadInputError(f"head module '{name}': there is another '{record.name}'; choose another name")
-        heads_of(record.name for record in module.HEAD_SETS)

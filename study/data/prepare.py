@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from study.config.heads import load_heads
 from study.config.keys import drive_name, frames_key, recording_key
+from study.config.modules import load_modules
 from study.config.settings import StudySettings
 from study.config.workspace import HERE
 from study.engine.flows import run_flow
@@ -93,13 +93,13 @@ def drives_flow(settings: StudySettings, root: Path = HERE.data) -> Flow[list[Pa
 
 
 def describe_data(
-    root: Path, settings: StudySettings, imported: Imported | None, head_modules: Sequence[str] = ()
+    root: Path, settings: StudySettings, imported: Imported | None, modules: Sequence[str] = ()
 ) -> Described:
     """Return the manifest of the frame store and the files of its data card by name; makes what is missing."""
     from study.data.card import card_files, source_drives  # noqa: PLC0415 - pictures, which training needs not
     from study.data.frames import open_frames  # noqa: PLC0415
 
-    load_heads(head_modules)
+    load_modules(modules)
     folder = frames_folder(settings, root, imported)
     if not (folder / "manifest.json").is_file():
         run_flow(data_flow(settings, root, imported))

@@ -134,7 +134,7 @@ def cell_jobs(plan: Plan, device: str, threads: int) -> dict[str, CellJob]:
     """Return what training each cell needs to know, by key."""
     seeds, folders = plan.grid.policy_seeds, (plan.frames, plan.drives, plan.workspace.data)
     return {
-        key: CellJob(cell, key, plan.settings, seeds, *folders, device, threads, plan.imported, plan.grid.head_modules)
+        key: CellJob(cell, key, plan.settings, seeds, *folders, device, threads, plan.imported, plan.grid.modules)
         for key, cell in plan.cells.items()
     }
 

@@ -129,7 +129,7 @@ def _data_flow(plan: Plan, engine: Engine) -> Flow[Any]:
     """Make and describe the frames: here, with the engine's help, unless its workers have folders of their own."""
     if _shares_folder(plan.workspace.data, engine):
         yield from data_flow(plan.settings, plan.workspace.data, plan.imported)
-    arguments = (plan.workspace.data, plan.settings, plan.imported, plan.grid.head_modules)
+    arguments = (plan.workspace.data, plan.settings, plan.imported, plan.grid.modules)
     (described,) = yield Batch([Task(DESCRIBE, describe_data, arguments)])
     return described
 

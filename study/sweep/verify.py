@@ -164,7 +164,7 @@ def compute_again(plan: Plan, recorded: CellResult, display: Display) -> CellRes
             "auto" if use else "cpu",
             int(recorded.facts["threads"]),
             plan.imported,
-            plan.grid.head_modules,
+            plan.grid.modules,
         )
         again, _ = run_flow(
             cell_flow(job, one_share=bool(use)), engine, lambda *how: display.progress(recorded.key, *how)
