@@ -259,7 +259,7 @@ def test_publish_builds_from_the_tracker_alone_and_logs_what_it_made(tracker, co
 
 
 def test_a_sweep_that_varies_one_setting_is_found_and_takes_nobodys_place(tracker, committed, capsys):
-    from study.tracking.variants import read_variants
+    from study.tracking.variants import with_variants
 
     record = committed[0]
     settings = record.settings.model_copy(
@@ -272,10 +272,10 @@ def test_a_sweep_that_varies_one_setting_is_found_and_takes_nobodys_place(tracke
         new = f"v{key[1:]}"
         tracker.commit(tracker.start_cell(run, planned[new], new, settings, 3), replace(result, key=new))
     tracker.close_sweep(run, "FINISHED")
-    assert {name: one.grid.name for name, one in read_variants(tracker.reader, record).items()} == {
+    assert {name: one.grid.name for name, one in with_variants(tracker.reader, record).variants.items()} == {
         "frames.split": "pair-split"
     }
-    back = read_variants(tracker.reader, tracker.reader.read_sweep("pair-split"))
+    back = with_variants(tracker.reader, tracker.reader.read_sweep("pair-split")).variants
     assert {name: one.grid.name for name, one in back.items()} == {"frames.split": "pair"}
     assert tracker.reader.read_sweep("pair").settings == record.settings
     assert __main__.main(["pair", "--format", "md", "--tracking", tracker.experiment.uri]) == 0

@@ -21,7 +21,7 @@ from study.config.grid import Cell, Grid
 from study.config.settings import StudySettings
 from study.errors import BadInputError, masked
 from study.results.cell_result import ARRAYS, CellResult
-from study.tracking.experiment import SQLITE, TrackerLostError
+from study.tracking.experiment import SQLITE, TrackerLostError, UnreadableError
 from study.tracking.reader import Reader
 from study.tracking.tracker import Tracker
 from tests.support.servers import TrackingServer, free_port
@@ -489,7 +489,7 @@ def test_files_are_added_to_a_run(tracker, tmp_path):
 
 
 @pytest.mark.parametrize("damage", ["cut", "missing", "swapped"])
-def test_a_finished_cell_without_its_complete_result_is_one_clear_error(tracker, damage):
+def test_a_finished_cell_without_its_complete_result_is_left_out_and_named(tracker, damage):
     planned = cells(damage)
     sweep = open_sweep(tracker, planned)
     run_id = train(tracker, sweep, planned, f"{damage}-0")
@@ -501,8 +501,12 @@ def test_a_finished_cell_without_its_complete_result_is_one_clear_error(tracker,
     else:
         other = Path(tracker.client.get_run(train(tracker, sweep, planned, f"{damage}-1")).info.artifact_uri)
         shutil.copy(other / "result" / "cell.json", folder)
-    with pytest.raises(BadInputError, match=rf"{run_id}.*run the sweep again"):
-        tracker.reader.read_sweep("heads")
+    with pytest.raises(UnreadableError, match=rf"{run_id}.*run the sweep again"):
+        tracker.reader.load_result(run_id)
+    record = tracker.reader.read_sweep("heads")
+    assert f"{damage}-0" not in record.results
+    assert "cannot be read" in record.failed[f"{damage}-0"]
+    assert run_id in record.unread[0]
 
 
 def test_a_moved_store_is_refused_until_its_old_place_is_a_link(tmp_path, empty_store):

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
 import typst
@@ -23,7 +24,7 @@ from study.report.summary import summarise
 from study.report.text import document
 from study.results.sweep_record import SweepRecord
 from study.tracking.tracker import Tracker
-from study.tracking.variants import read_variants
+from study.tracking.variants import with_variants
 
 TEMPLATE = Path(__file__).with_name("report.typ")
 
@@ -62,17 +63,19 @@ def typeset(title: str, footer: str, blocks: Sequence[Block], pictures: dict[str
 
 def publish(tracker: Tracker, name: str, profile: str | None, folder: Path) -> Path:
     """Build the report from the tracker alone, and add it to the sweep's run. Returns the PDF's path."""
-    pdf = build_report(complete_cells(tracker, name, profile), folder)
-    files, sweep_run = folder / name, tracker.reader.sweep_run(name, profile)
-    tracker.log_files(sweep_run, [pdf, files / "report.json", files / "curves.parquet"], "report")
-    tracker.log_files(sweep_run, sorted((files / "figures").iterdir()), "figures")
+    record = complete_cells(tracker, name, profile)
+    pdf, files = build_report(record, folder), folder / name
+    tracker.log_files(record.run_id, [pdf, files / "report.json", files / "curves.parquet"], "report")
+    tracker.log_files(record.run_id, sorted((files / "figures").iterdir()), "figures")
     return pdf
 
 
 def complete_cells(tracker: Tracker, name: str, profile: str | None) -> SweepRecord:
-    """Return a sweep with those that vary one of its confounds."""
-    record = tracker.reader.read_sweep(name, profile)
-    return replace(record, variants=read_variants(tracker.reader, record))
+    """Return a sweep with those that vary one of its confounds; say on stderr what cannot be read."""
+    record = with_variants(tracker.reader, tracker.reader.read_sweep(name, profile))
+    for line in record.unread:
+        print(f"left out of the report: {line}", file=sys.stderr)
+    return record
 
 
 def report_as_markdown(tracker: Tracker, name: str, profile: str | None) -> str:

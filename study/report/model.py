@@ -228,7 +228,10 @@ class Provenance(Part):
 
 
 class Report(Part):
-    """Every number of a sweep's report: NaN where there is none, infinite for an epoch that is never reached."""
+    """Every number of a sweep's report: NaN where there is none, infinite for an epoch that is never reached.
+
+    `unread`: what of the sweep and of those that it is compared with could not be read.
+    """
 
     format_version: int = FORMAT_VERSION
     sweep: Sweep
@@ -249,6 +252,7 @@ class Report(Part):
     cost: Cost
     provenance: Provenance
     figures: tuple[str, ...] = ()
+    unread: tuple[str, ...] = ()
 
     @property
     def rules_are_younger(self) -> bool:

@@ -99,6 +99,7 @@ def summarise(record: SweepRecord) -> Report:
         data=_data(record),
         cost=_cost(record),
         provenance=_provenance(record),
+        unread=record.unread,
     )
 
 

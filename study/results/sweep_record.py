@@ -19,7 +19,8 @@ class SweepRecord:
     """A sweep as the tracker knows it: what was planned, what is finished, what failed (key -> reason).
 
     `provenance`: commit, uncommitted diff, versions, machine; `data`: the frame store's manifest; `variants`: sweeps
-    that differ in one setting only, by its name.
+    that differ in one setting only, by its name; `run_id`: of its run in MLflow; `unread`: what of all this could not
+    be read and is left out, and why.
     """
 
     grid: Grid
@@ -31,6 +32,8 @@ class SweepRecord:
     provenance: dict[str, Any] = field(default_factory=dict)
     data: dict[str, Any] = field(default_factory=dict)
     variants: dict[str, SweepRecord] = field(default_factory=dict)
+    run_id: str = ""
+    unread: tuple[str, ...] = ()
 
     @property
     def complete(self) -> bool:

@@ -48,6 +48,10 @@ class TrackerLostError(BadInputError):
     """The store does not answer or cannot be written just now: another try may help."""
 
 
+class UnreadableError(BadInputError):
+    """Something of a run is missing or damaged, although the store answers: reports name it and go on without it."""
+
+
 @dataclass(frozen=True)
 class Experiment:
     """An experiment of an open store. `uri` is the store's, without credentials."""
@@ -76,19 +80,27 @@ class Experiment:
             if not token:
                 return sorted(runs, key=lambda run: (run.info.start_time, run.info.run_id))
 
+    def download(self, run_id: str, artifact: str, folder: str) -> Path:
+        """Copy an artifact into a folder. Raises UnreadableError, and TrackerLostError when the store is away."""
+        try:
+            return Path(self.client.download_artifacts(run_id, artifact, folder))
+        except STORE_ERRORS as error:
+            reason = " ".join(masked(str(error)).replace(f"{folder}/", "").split())[:200]
+        with self.guard():
+            self.client.get_run(run_id)  # it answers, so the artifact is at fault
+        raise UnreadableError(f"{artifact} of run {run_id} in {self.uri} cannot be read: {reason}")
+
     def read_text(self, run_id: str, artifact: str) -> str:
-        """Return the content of a text artifact."""
+        """Return the content of a text artifact. Raises as `download`."""
         with tempfile.TemporaryDirectory() as folder:
-            return Path(self.client.download_artifacts(run_id, artifact, folder)).read_text(encoding="utf-8")
+            return self.download(run_id, artifact, folder).read_text(encoding="utf-8", errors="replace")
 
     def read_json(self, run_id: str, artifact: str) -> dict[str, Any]:
-        """Return the content of a JSON artifact. Raises BadInputError when it is damaged."""
+        """Return the content of a JSON artifact. Raises as `download`."""
         try:
             return dict(json.loads(self.read_text(run_id, artifact)))
         except (ValueError, TypeError):
-            raise BadInputError(
-                f"{artifact} of run {run_id} in {self.uri} is no JSON object; run the sweep again"
-            ) from None
+            raise UnreadableError(f"{artifact} of run {run_id} in {self.uri} is no JSON object") from None
 
 
 def open_experiment(uri: str, name: str) -> Experiment:

@@ -7,9 +7,8 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Self
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 from mlflow.entities import Run
 
@@ -19,7 +18,7 @@ from study.config.workspace import HERE
 from study.errors import BadInputError
 from study.results.cell_result import CellResult
 from study.results.sweep_record import SweepRecord
-from study.tracking.experiment import Experiment, find_experiment
+from study.tracking.experiment import Experiment, TrackerLostError, UnreadableError, find_experiment
 
 PLAN_VERSION = 1
 RESULT = "result"  # artifact folder of a cell run
@@ -80,16 +79,18 @@ class Reader:
         return {key: reason_of(attempt.tags) for key, attempt in last.items() if PERMANENT in attempt.tags}
 
     def load_result(self, run_id: str) -> CellResult:
-        """Return the result that a finished cell run holds. Raises BadInputError when it is damaged."""
+        """Return the result that a finished cell run holds. Raises UnreadableError when it is missing or damaged."""
         with self.experiment.guard(), tempfile.TemporaryDirectory() as folder:
             key = self.experiment.client.get_run(run_id).data.tags.get("cell_key")
             try:
-                result = CellResult.load(Path(self.experiment.client.download_artifacts(run_id, RESULT, folder)))
+                result = CellResult.load(self.experiment.download(run_id, RESULT, folder))
                 problem = "" if result.key == key else f"it is the result of cell {result.key}"
+            except TrackerLostError:
+                raise
             except (OSError, BadInputError) as error:
                 problem = str(error).replace(f"{folder}/", "")
         if problem:
-            raise BadInputError(
+            raise UnreadableError(
                 f"cell run {run_id} in {self.experiment.uri} is FINISHED but does not hold the result of cell {key} "
                 f"({problem}); delete that run in MLflow and run the sweep again"
             )
@@ -100,13 +101,16 @@ class Reader:
         with self.experiment.guard():
             return sorted(self.experiment.search("tags.kind = 'sweep'"), key=opened_at)
 
-    def sweep_run(self, name: str, profile: str | None = None) -> str:
-        """Return the run id of the latest sweep of that name. Raises BadInputError when there is none."""
+    def sweeps_of(self, name: str, profile: str | None = None) -> list[str]:
+        """Return the run ids of the sweeps of that name, the latest first. Raises BadInputError when there is none."""
         runs = self.sweep_runs()
-        for run in reversed(runs):
-            tags = run.data.tags
-            if tags.get("sweep") == name and profile in (None, tags.get("profile")):
-                return str(run.info.run_id)
+        found = [
+            str(run.info.run_id)
+            for run in reversed(runs)
+            if run.data.tags.get("sweep") == name and profile in (None, run.data.tags.get("profile"))
+        ]
+        if found:
+            return found
         wanted = f"{name} ({profile})" if profile else name
         names = ", ".join(sorted({str(run.info.run_name) for run in runs})) or "none yet"
         raise BadInputError(
@@ -115,37 +119,59 @@ class Reader:
         )
 
     def read_sweep(self, name: str, profile: str | None = None) -> SweepRecord:
-        """Return the latest sweep of that name with its finished cells."""
-        return self.read_sweep_run(self.sweep_run(name, profile))
+        """Return the latest readable sweep of that name with its finished cells; what is unreadable is named in it."""
+        unread: list[str] = []
+        for run_id in self.sweeps_of(name, profile):
+            try:
+                record = self.read_sweep_run(run_id)
+            except UnreadableError as error:
+                unread.append(str(error))
+            else:
+                return replace(record, unread=(*unread, *record.unread))
+        raise UnreadableError(
+            f"no sweep '{name}' can be read: {'; '.join(unread)}. Run the sweep again: what is finished is kept"
+        )
 
     def read_settings(self, sweep_run_id: str) -> StudySettings:
         """Return a sweep's settings. Raises BadInputError when another version of this program planned it."""
         return self._read_plan(sweep_run_id)[2]
 
     def read_sweep_run(self, run_id: str) -> SweepRecord:
-        """Return a sweep with its finished cells."""
+        """Return a sweep with its finished cells. Raises UnreadableError when its plan or its data cannot be read."""
         grid, profile, settings, planned = self._read_plan(run_id)
-        with self.experiment.guard():
+        data = self.experiment.read_json(run_id, "data.json")
+        unread: list[str] = []
+        provenance: dict[str, Any] = {}
+        try:
             provenance = self.experiment.read_json(run_id, "provenance.json")
             provenance["diff"] = self.experiment.read_text(run_id, "uncommitted.diff")
-            data = self.experiment.read_json(run_id, "data.json")
+        except UnreadableError as error:
+            unread.append(str(error))
+        with self.experiment.guard():
             failures = self.experiment.search("tags.kind = 'cell' and attributes.status = 'FAILED'")
         done = self.finished(planned)
         reasons = {run.data.tags.get("cell_key"): reason_of(run.data.tags) for run in failures}
         failed = {key: reason for key, reason in reasons.items() if key in planned and key not in done}
-        results = {key: self.load_result(run) for key, run in done.items()}
-        return SweepRecord(grid, profile, settings, planned, results, failed, provenance, data)
+        results: dict[str, CellResult] = {}
+        for key, run in done.items():
+            try:
+                results[key] = self.load_result(run)
+            except UnreadableError as error:
+                failed[key] = f"its result cannot be read: {error}"
+                unread.append(f"{planned[key].label}: {error}")
+        return SweepRecord(
+            grid, profile, settings, planned, results, failed, provenance, data, run_id=run_id, unread=tuple(unread)
+        )
 
     def _read_plan(self, run_id: str) -> tuple[Grid, str, StudySettings, dict[str, Cell]]:
-        with self.experiment.guard():
-            plan = self.experiment.read_json(run_id, "plan.json")
+        plan = self.experiment.read_json(run_id, "plan.json")
         try:
             if plan.get("format_version") != PLAN_VERSION:
                 raise ValueError(f"format {plan.get('format_version')}, not {PLAN_VERSION}")  # noqa: TRY301
             planned = {key: Cell.model_validate(cell) for key, cell in plan["planned"].items()}
             grid = Grid.model_validate(plan["grid"])  # first: it loads the heads that the settings may name
             return grid, str(plan["profile"]), StudySettings.model_validate(plan["settings"]), planned
-        except ValueError as error:  # pydantic's error is one
+        except (ValueError, KeyError, TypeError, AttributeError) as error:  # pydantic's error is a ValueError
             raise BadInputError(
                 f"sweep run {run_id} in {self.experiment.uri} was planned by another version of this program "
                 f"({error}); run the sweep again"

@@ -33,7 +33,7 @@ from study.config.workspace import HERE
 from study.errors import masked
 from study.results.cell_result import CellResult
 from study.tracking.cell_run import ALIVE, HOST, PROCESS, CellRun, Status
-from study.tracking.experiment import TrackerLostError, few_tries, open_experiment
+from study.tracking.experiment import TrackerLostError, UnreadableError, few_tries, open_experiment
 from study.tracking.metrics import COMMIT, bands, cell_points, describe_facts, final_scores, flatten, points
 from study.tracking.model import log_model
 from study.tracking.reader import PERMANENT, PLAN_VERSION, RESULT, Reader, in_order_of_end, opened_at
@@ -122,9 +122,10 @@ class Tracker:
         """End a sweep run and the cell runs under it that are still RUNNING; KILLED does not wait long for a server."""
         with self.experiment.guard(), few_tries() if status == "KILLED" else nullcontext():
             self._close_cells(sweep_run_id)
-            planned = self.experiment.read_json(sweep_run_id, "plan.json")["planned"]
-            done = len(self.reader.finished(planned))
-            self.client.set_tag(sweep_run_id, "cells", f"{done} of {len(planned)} finished")
+            with suppress(UnreadableError):  # somebody has removed it meanwhile
+                planned = self.experiment.read_json(sweep_run_id, "plan.json")["planned"]
+                done = len(self.reader.finished(planned))
+                self.client.set_tag(sweep_run_id, "cells", f"{done} of {len(planned)} finished")
             self.client.set_terminated(sweep_run_id, status)
 
     def _close_cells(self, sweep_run_id: str) -> None:

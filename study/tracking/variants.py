@@ -2,25 +2,38 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from study.analysis.confounds import contrasts, varied
 from study.errors import BadInputError
 from study.results.sweep_record import SweepRecord
+from study.tracking.experiment import TrackerLostError, UnreadableError
 from study.tracking.reader import Reader
 
 
-def read_variants(reader: Reader, record: SweepRecord) -> dict[str, SweepRecord]:
-    """Return, by setting, the latest sweep of the same profile that differs from this one in that confound alone."""
+def with_variants(reader: Reader, record: SweepRecord) -> SweepRecord:
+    """Return a sweep with, by setting, the latest one of its profile that differs from it in that confound alone.
+
+    Sweeps that cannot be read are named in `unread` and left out.
+    """
     variants: dict[str, SweepRecord] = {}
+    unread = list(record.unread)
     for run in reversed(reader.sweep_runs()):
-        if run.data.tags.get("profile") != record.profile:
+        if run.data.tags.get("profile") != record.profile or run.info.run_id == record.run_id:
             continue
         try:
             confound = varied(record.settings, reader.read_settings(run.info.run_id))
             if confound is None or confound.setting in variants:
                 continue
             variant = reader.read_sweep_run(run.info.run_id)
-        except BadInputError:  # planned by another version, or damaged: nothing to compare with
+        except TrackerLostError:
+            raise
+        except UnreadableError as error:
+            unread.append(f"sweep {run.info.run_name}, to compare with: {error}")
+            continue
+        except BadInputError:  # planned by another version: nothing to compare with
             continue
         if contrasts(record, variant, confound):
             variants[confound.setting] = variant
-    return variants
+            unread += [f"sweep {run.info.run_name}, compared with: {line}" for line in variant.unread]
+    return replace(record, variants=variants, unread=tuple(dict.fromkeys(unread)))
