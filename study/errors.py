@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import re
-from pathlib import Path
 
 
 class BadInputError(Exception):
@@ -32,16 +31,23 @@ def masked(text: str) -> str:
 
 EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
 EXIT_AGAIN = 75  # of study.sweep train: cells are left, the same command continues
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 # A disk that is full, a folder that cannot be: the user can change that, anything else is a fault.
-WRITE_ERRORS = (
-    *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG),
-    *(errno.EACCES, errno.EROFS, errno.ENOTDIR, errno.EEXIST),
+WRITE_ERRORS = (*FULL, errno.EACCES, errno.EROFS, errno.ENOTDIR, errno.EEXIST)
+WRITERS = (  # what libraries say of a full disk in errors of their own, in small letters
+    *("no space left on device", "disk quota exceeded", "disk is full"),
+    *("pytorchstreamwriter", "inline_container.cc", "iostream error", "file write failed"),  # torch's archives
 )
+GO_ON = "make room or name another folder, then give the same command again: it goes on where it was"
 
 
-def cannot_write(path: Path, error: OSError) -> str:
-    """Explain one of the WRITE_ERRORS to a user."""
-    return (
-        f"cannot write {path}: {error.strerror}; make room or name another folder, then give the same command again: "
-        "it goes on where it was"
-    )
+def write_failure(error: BaseException) -> str | None:
+    """Return what to tell a user when an error, or one behind it, says that a file cannot be written; else None."""
+    if isinstance(error, OSError) and error.errno in WRITE_ERRORS:
+        return f"cannot write {error.filename or 'a file'}: {error.strerror}; {GO_ON}"
+    if not isinstance(error, BadInputError) and any(words in str(error).lower() for words in WRITERS):
+        return f"cannot write a file, probably since the disk is full: {str(error).splitlines()[0]}; {GO_ON}"
+    behind = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
+    if behind is None or (isinstance(behind, OSError) and behind.errno not in FULL):
+        return None
+    return write_failure(behind)

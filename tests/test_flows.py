@@ -3,8 +3,11 @@
 import os
 import platform
 from collections import deque
+from pathlib import Path
 
+import pandas as pd
 import pytest
+import torch
 
 from study.engine.flows import TRIES, FlowFailedError, run_flow
 from study.engine.tasks import perform
@@ -174,6 +177,50 @@ def test_a_failure_that_would_come_again_is_not_tried_again(error):
     assert not events.failures["a"].transient
     assert str(error) in events.failures["a"].reason
     assert ("Traceback" in events.failures["a"].reason) == (not events.failures["a"].expected)
+
+
+def to_parquet():
+    pd.DataFrame({"a": [1]}).to_parquet("/dev/full")
+
+
+def behind_another():
+    try:
+        Path("/dev/full").write_bytes(b"x")
+    except OSError as error:
+        raise BadInputError("the file cannot be used") from error
+
+
+FULL_DISK = {  # whoever writes has an error of its own
+    "bytes": lambda: Path("/dev/full").write_bytes(b"x"),
+    "a small archive of torch": lambda: torch.save({"a": torch.zeros(10)}, "/dev/full"),
+    "a large archive of torch": lambda: torch.save({"a": torch.zeros(10**6)}, "/dev/full"),
+    "a table": to_parquet,
+    "behind another error": behind_another,
+}
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="a full disk is /dev/full on Linux")
+@pytest.mark.parametrize("write", FULL_DISK.values(), ids=FULL_DISK.keys())
+@pytest.mark.parametrize("between", [False, True])
+def test_a_full_disk_is_a_failure_that_may_pass_whoever_writes(write, between):
+    def flow():
+        yield from steps([], "x", 1)
+        write()
+
+    events = run({"a": flow() if between else iter_batch([Task(ENCODER, write, ())]), "b": steps([], "b", 1)})
+    assert events.products.keys() == {"b"}
+    assert len(events.retries) == (0 if between else TRIES - 1)
+    assert events.failures["a"].transient
+    assert "Traceback" not in events.failures["a"].reason
+
+
+def test_an_error_of_this_program_between_stages_is_no_failure_of_a_cell():
+    def flow():
+        yield from steps([], "x", 1)
+        raise RuntimeError("a fault")
+
+    with pytest.raises(RuntimeError, match="a fault"):
+        run({"a": flow()})
 
 
 def test_the_tries_of_one_task_are_not_counted_for_another():

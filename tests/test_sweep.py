@@ -60,15 +60,17 @@ def test_datasize_reuses_the_cells_of_heads(folder):
 @pytest.mark.stress
 def test_a_failed_cell_is_reported_leaves_the_others_alone_and_runs_again_on_request(undisturbed, tmp_path):
     undisturbed.copy(tmp_path)
-    words = (*FOUR_CELLS, "--heads", "[rec,rec+pred]", "--encoder.lr", "1e30", "--no-report")
-    for more, tries in ((), 2), ((), 2), (("--retry-failed",), 4):
+    words = (*FOUR_CELLS, "--heads", "[rec,rec+pred]", "--encoder.lr", "1e30")
+    for more, tries in ((), 2), (("--no-report",), 2), (("--no-report", "--retry-failed"), 4):
         completed = sweep(tmp_path, *words, *more)
         assert completed.returncode == 1
         assert "failed: rec 100% e0" in completed.stderr
         assert "failed: rec+pred 100% e0" in completed.stderr
         assert "epoch" in completed.stderr
         assert " --retry-failed\n" in completed.stderr
+        assert "Traceback" not in completed.stderr
         assert run_database(tmp_path).cell_counts() == {"FAILED": tries}
+    assert (tmp_path / "reports/heads.pdf").is_file()
 
 
 @pytest.mark.stress

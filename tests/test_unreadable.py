@@ -125,3 +125,17 @@ def test_a_sweep_whose_plan_is_removed_meanwhile_can_be_closed(store):
     tracker, varied, _ = store
     shutil.rmtree(artifacts(tracker, varied))
     tracker.close_sweep(varied, "FINISHED")
+
+
+def test_a_sweep_of_which_every_cell_has_failed_has_a_report_with_the_reasons(store, tmp_path):
+    tracker, _, _ = store
+    record = simulate(PAIR.model_copy(update={"name": "doomed"}), World(epochs=6))
+    planned = {f"d{key[1:]}": cell for key, cell in record.planned.items()}
+    run = tracker.open_sweep(record.grid, "laptop", record.settings, planned, record.data, record.provenance)
+    for key, cell in planned.items():
+        attempt = tracker.start_cell(run, cell, key, record.settings, 3)
+        tracker.fail(attempt, "the loss of epoch 3 is nan", permanent=True)
+    tracker.close_sweep(run, "FAILED")
+    assert publish(tracker, "doomed", None, tmp_path).read_bytes().startswith(b"%PDF")
+    failed = read_report(tmp_path / "doomed").sweep.failed
+    assert [failure.reason for failure in failed] == ["the loss of epoch 3 is nan"] * 2

@@ -18,7 +18,7 @@ from pydantic.fields import FieldInfo
 from study.config.files import named_files
 from study.config.workspace import HERE
 from study.console.interrupts import EXITS_AT_ONCE
-from study.errors import EXIT_BAD_INPUT, BadInputError, masked
+from study.errors import EXIT_BAD_INPUT, BadInputError, masked, write_failure
 
 Decorator = Callable[[Callable[..., Any]], Any]
 
@@ -132,6 +132,12 @@ def run(main: Callable[[Sequence[str]], int]) -> NoReturn:
     except BrokenPipeError:  # the reader, such as `head`, has seen enough
         sys.stderr.close()
         code = 0
+    except Exception as error:
+        problem = write_failure(error)
+        if problem is None:
+            raise
+        print(f"error: {masked(problem)}", file=sys.stderr)
+        code = EXIT_BAD_INPUT
     if code in EXITS_AT_ONCE:  # Dask would wait for its workers, which end by themselves
         sys.stdout.flush()
         sys.stderr.flush()

@@ -140,8 +140,11 @@ class _Runner:
                 batch = running.flow.send([])
         except StopIteration as end:
             self._listener.finished(running.name, end.value)
-        except (BadInputError, TrainingDivergedError, OSError) as error:
-            self._listener.failed(running.name, failure_of(error))
+        except (BadInputError, TrainingDivergedError, OSError, RuntimeError) as error:
+            failure = failure_of(error)
+            if not (failure.transient or failure.expected):
+                raise  # a fault of this program
+            self._listener.failed(running.name, failure)
         else:
             running.batch, running.results, running.shares, running.total = batch, {}, {}, 0
             running.logs.clear()

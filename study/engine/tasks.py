@@ -8,10 +8,9 @@ import platform
 import traceback
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Protocol
 
-from study.errors import WRITE_ERRORS, BadInputError, TrainingDivergedError, cannot_write
+from study.errors import BadInputError, TrainingDivergedError, write_failure
 from study.stages import Task
 
 NO_MEMORY = ("out of memory", "can't allocate memory")  # in torch's RuntimeErrors of GPUs and CPUs
@@ -67,10 +66,11 @@ def perform(task: Task, report: Callable[..., None]) -> Any:
 
 def failure_of(error: Exception) -> Failure:
     """Return what an exception means: whether another try may succeed, and the reason."""
+    problem = write_failure(error)
     if isinstance(error, BadInputError | TrainingDivergedError):
-        return Failure(str(error), transient=False)
-    if isinstance(error, OSError) and error.errno in WRITE_ERRORS:
-        return Failure(cannot_write(Path(error.filename or "a file"), error), transient=True)
+        return Failure(str(error), transient=problem is not None)
+    if problem:
+        return Failure(problem, transient=True)
     no_memory = isinstance(error, RuntimeError) and any(words in str(error).lower() for words in NO_MEMORY)
     transient = isinstance(error, OSError | MemoryError) or no_memory
     return Failure("".join(traceback.format_exception(error)), transient, expected=False)

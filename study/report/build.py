@@ -66,7 +66,7 @@ def publish(tracker: Tracker, name: str, profile: str | None, folder: Path) -> P
     record = complete_cells(tracker, name, profile)
     pdf, files = build_report(record, folder), folder / name
     tracker.log_files(record.run_id, [pdf, files / "report.json", files / "curves.parquet"], "report")
-    tracker.log_files(record.run_id, sorted((files / "figures").iterdir()), "figures")
+    tracker.log_files(record.run_id, sorted((files / "figures").glob("*")), "figures")
     return pdf
 
 

@@ -7,7 +7,7 @@ import os
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -40,14 +40,20 @@ def execute(plan: Plan, options: RunOptions, command: str, *, report: bool) -> i
     with hold_store(plan, options.tracking, wait=options.wait):
         tracker = Tracker(options.tracking)
         failed = run_cells(plan, options, tracker)
-        if report:
-            print("writing the report", file=sys.stderr)
-            write_report(plan, tracker)
+        try:
+            if report:
+                print("writing the report", file=sys.stderr)
+                write_report(plan, tracker)
+        finally:  # whatever becomes of the report
+            _say_failed(plan, failed, command)
+    return EXIT_FAILED if failed else 0
+
+
+def _say_failed(plan: Plan, failed: Mapping[str, str], command: str) -> None:
     for key, reason in failed.items():
         print(f"failed: {plan.cells[key].label} ({key}): {reason.strip()}", file=sys.stderr)
     if failed:
         print(f"Once the cause is gone: {command.removesuffix(' --retry-failed')} --retry-failed", file=sys.stderr)
-    return EXIT_FAILED if failed else 0
 
 
 def write_report(plan: Plan, tracker: Tracker) -> None:
