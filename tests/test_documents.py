@@ -29,6 +29,7 @@ from markdown.extensions.toc import slugify
 from mkdocs.commands.build import build
 from mkdocs.config import load_config
 
+from study.config.baselines import BASELINES
 from study.config.heads import HEAD_SETS, HEADS
 from study.config.settings import StudySettings
 from study.errors import BadInputError
@@ -83,7 +84,7 @@ def folder(tmp_path, monkeypatch):
     submit.chmod(0o755)
     monkeypatch.setenv("PATH", f"{submit.parent}:{os.environ['PATH']}")
     monkeypatch.chdir(tmp_path)
-    with patch.dict(HEADS), patch.dict(HEAD_SETS):  # a sweep file may add to them
+    with patch.dict(HEADS), patch.dict(HEAD_SETS), patch.dict(BASELINES):  # a sweep file may add to them
         yield tmp_path
 
 
