@@ -25,7 +25,7 @@ from study.stages import Flow
 from study.sweep.options import RunOptions
 from study.sweep.plan import Plan, cell_jobs
 from study.tracking.cell_run import CellRun
-from study.tracking.experiment import SQLITE, TrackerLostError
+from study.tracking.experiment import SQLITE, DeletedError, TrackerLostError
 from study.tracking.tracker import Tracker
 
 PATIENCE, RETRY = 600.0, 3.0  # [s] a lost server is waited for, and between two tries
@@ -82,11 +82,7 @@ class Committing:
     def started(self, name: str, host: str, process: int) -> None:
         """Open the cell's run when its first task starts; note who runs it."""
         if name not in self._runs:
-            job = self._jobs[name]
-            begin = self._tracker.start_cell
-            self._runs[name] = self._patiently(
-                begin, self._sweep_run, job.cell, job.key, job.settings, job.policy_seeds
-            )
+            self._begin(name)
             self._display.start(name)
         self._runs[name].note(host=host, process=str(process))
 
@@ -103,8 +99,8 @@ class Committing:
     def finished(self, name: str, value: tuple[CellResult, bytes]) -> None:
         """Commit a result."""
         result, network = value
-        run = self._runs.pop(name)
-        self._patiently(self._tracker.commit, run, result, network)
+        self._write(name, lambda run: self._tracker.commit(run, result, network))
+        del self._runs[name]
         self._trials.finish(name, _score(result))
         for folder in product_folders(self._jobs[name]):
             shutil.rmtree(folder, ignore_errors=True)
@@ -115,20 +111,53 @@ class Committing:
         self._failed[name] = masked(failure.reason)
         if name not in self._runs:  # before anything of it ran
             self.started(name, "", os.getpid())
-        self._patiently(self._tracker.fail, self._runs.pop(name), failure.reason, permanent=not failure.transient)
+        self._write(name, lambda run: self._tracker.fail(run, failure.reason, permanent=not failure.transient))
+        del self._runs[name]
         self._trials.fail(name, failure.reason)
         self._display.fail(name)
 
     def tick(self) -> None:
         """Write live curves, and draw the display again."""
-        for run in self._runs.values():
-            run.flush_live()
+        for name, run in list(self._runs.items()):
+            try:
+                run.flush_live()
+            except DeletedError as error:
+                self._begin_again(name, error)
         self._display.tick()
 
     def close(self) -> dict[str, str]:
         """End the sweep's run; returns the cells that failed, with the reasons."""
-        self._patiently(self._tracker.close_sweep, self._sweep_run, "FAILED" if self._failed else "FINISHED")
+        self._restoring(self._tracker.close_sweep, self._sweep_run, "FAILED" if self._failed else "FINISHED")
         return self._failed
+
+    def _begin(self, name: str) -> None:
+        """Open a run for a cell."""
+        job = self._jobs[name]
+        words = self._sweep_run, job.cell, job.key, job.settings, job.policy_seeds
+        self._runs[name] = self._restoring(self._tracker.start_cell, *words)
+
+    def _begin_again(self, name: str, error: DeletedError) -> None:
+        """Open another run for a cell whose run somebody has deleted; its training goes on."""
+        self._display.say(f"{self._plan.cells[name].label}: {error}; the cell goes on in a new run")
+        self._patiently(self._tracker.restore, self._sweep_run)
+        self._begin(name)
+
+    def _write(self, name: str, action: Callable[[CellRun], T]) -> T:
+        """Write to a cell's run; when somebody has deleted it, to another one."""
+        try:
+            return self._patiently(action, self._runs[name])
+        except DeletedError as error:
+            self._begin_again(name, error)
+            return self._patiently(action, self._runs[name])
+
+    def _restoring(self, action: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """Do something; when somebody has deleted the sweep's run or the experiment, take that back and try again."""
+        try:
+            return self._patiently(action, *args, **kwargs)
+        except DeletedError as error:
+            self._display.say(f"{error}; it is restored, since this sweep writes to it")
+            self._patiently(self._tracker.restore, self._sweep_run)
+            return self._patiently(action, *args, **kwargs)
 
     def _patiently(self, action: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
         """Do something that can be done again, and wait for a server that is away meanwhile."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -13,7 +12,7 @@ from mlflow.entities import Metric, RunTag
 from mlflow.tracking import MlflowClient
 
 from study.config.grid import Cell
-from study.tracking.experiment import STORE_ERRORS
+from study.tracking.experiment import STORE_ERRORS, DeletedError, is_deleted
 from study.tracking.metrics import CurvePoint
 
 HOST, PROCESS, ALIVE = "host", "process", "alive"  # tags of an attempt: who writes it, and when last [ms since 1970]
@@ -62,11 +61,17 @@ class CellRun:
                 self._pending.append(Metric(name, value, self.started + step, step))
 
     def flush_live(self) -> None:
-        """Write what was added, every few seconds. What cannot be written is kept: `commit` writes it or fails."""
+        """Write what was added, every few seconds. What cannot be written is kept: `commit` writes it or fails.
+
+        Raises DeletedError when somebody has deleted the run.
+        """
         if time.monotonic() - self._flushed >= FLUSH:
             self._flushed = time.monotonic()
-            with suppress(*STORE_ERRORS):
+            try:
                 self.flush()
+            except STORE_ERRORS as error:
+                if is_deleted(error):
+                    raise DeletedError(f"somebody has deleted its run {self.run_id} in MLflow") from None
 
     def flush(self) -> None:
         """Write what was added. After an error it can be written again: the same points are the same rows."""

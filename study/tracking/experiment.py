@@ -48,6 +48,10 @@ class TrackerLostError(BadInputError):
     """The store does not answer or cannot be written just now: another try may help."""
 
 
+class DeletedError(BadInputError):
+    """A run, or the experiment, was deleted in MLflow by somebody else."""
+
+
 class UnreadableError(BadInputError):
     """Something of a run is missing or damaged, although the store answers: reports name it and go on without it."""
 
@@ -138,11 +142,13 @@ def database_file(uri: str) -> Path | None:
 
 @contextmanager
 def guard(shown: str, *, opening: bool = False) -> Iterator[None]:
-    """Turn errors of the store into TrackerLostError; errors that tell of wrong calls stay what they are."""
+    """Turn errors of the store into TrackerLostError or DeletedError; those that tell of wrong calls stay."""
     try:
         yield
     except (*STORE_ERRORS, ImportError) as error:  # ImportError: the driver of a database is missing
         code = getattr(error, "error_code", None)
+        if is_deleted(error):
+            raise DeletedError(f"somebody has deleted in {shown} what was being written: {error}") from None
         if code in ("INVALID_PARAMETER_VALUE", "BAD_REQUEST") and not opening:
             raise
         text = " ".join(masked(str(error)).split())[:400]
@@ -153,6 +159,12 @@ def guard(shown: str, *, opening: bool = False) -> Iterator[None]:
             step = f"copy the file, then run: mlflow db upgrade {shown}"
         # `from None`: the chained error may show credentials.
         raise TrackerLostError(f"the tracking store {shown} gave no usable answer: {text}; {step}") from None
+
+
+def is_deleted(error: BaseException) -> bool:
+    """Return whether an error of MLflow says that a run or experiment is deleted, or removed for good."""
+    code = getattr(error, "error_code", None)
+    return code == "RESOURCE_DOES_NOT_EXIST" or (code == "INVALID_PARAMETER_VALUE" and "'active' state" in str(error))
 
 
 @contextmanager

@@ -33,7 +33,7 @@ from study.config.workspace import HERE
 from study.errors import masked
 from study.results.cell_result import CellResult
 from study.tracking.cell_run import ALIVE, HOST, PROCESS, CellRun, Status
-from study.tracking.experiment import TrackerLostError, UnreadableError, few_tries, open_experiment
+from study.tracking.experiment import DeletedError, TrackerLostError, UnreadableError, few_tries, open_experiment
 from study.tracking.metrics import COMMIT, bands, cell_points, describe_facts, final_scores, flatten, points
 from study.tracking.model import log_model
 from study.tracking.reader import PERMANENT, PLAN_VERSION, RESULT, Reader, in_order_of_end, opened_at
@@ -46,7 +46,8 @@ PARENT = "mlflow.parentRunId"
 class Tracker:
     """The writer of an experiment; `reader` reads from the same one.
 
-    Every method raises TrackerLostError, a BadInputError, when the store stops answering.
+    Every method raises TrackerLostError, a BadInputError, when the store stops answering, and DeletedError, another,
+    when somebody has deleted the run that it writes to.
     """
 
     def __init__(self, uri: str = HERE.tracking, experiment: str = "study") -> None:
@@ -132,6 +133,17 @@ class Tracker:
         running = f"tags.kind = 'cell' and attributes.status = 'RUNNING' and tags.`{PARENT}` = '{sweep_run_id}'"
         for run in self.experiment.search(running):
             self._close_run(run.info.run_id, "KILLED", {"reason": "the sweep ended"})
+
+    def restore(self, sweep_run_id: str) -> None:
+        """Take back that somebody has deleted the experiment or a sweep's run: a sweep that is going on needs them.
+
+        Raises DeletedError when they were removed for good.
+        """
+        with self.experiment.guard():
+            if self.client.get_experiment(self.experiment.id).lifecycle_stage != "active":
+                self.client.restore_experiment(self.experiment.id)
+            if self.client.get_run(sweep_run_id).info.lifecycle_stage != "active":
+                self.client.restore_run(sweep_run_id)
 
     def log_files(self, run_id: str, files: Iterable[Path], artifact_path: str) -> None:
         """Add files to a run's artifacts."""
@@ -251,7 +263,7 @@ class Tracker:
 
     def interrupt(self, cell_run: CellRun, reason: str = "stopped") -> None:
         """End an attempt that was stopped, quickly; when the store does not answer, the next attempt closes it."""
-        with suppress(TrackerLostError), self.experiment.guard(), few_tries():
+        with suppress(TrackerLostError, DeletedError), self.experiment.guard(), few_tries():
             self._close_run(cell_run.run_id, "KILLED", {"reason": reason})
 
     # --- runs -----------------------------------------------------------------------------------------------------
