@@ -140,11 +140,6 @@ def test_a_log_without_lights_or_routes_is_fine(drive):
     assert len(valid_moments(adapted, load_profile("smoke").birdview))
 
 
-def test_headings_in_degrees_are_refused(drive):
-    with pytest.raises(BadInputError, match=r"states\.parquet, row \d+, field 'heading'"):
-        adapt(dataclasses.replace(drive, heading=np.degrees(drive.heading)), "drive")
-
-
 def test_too_low_a_rate_is_refused(drive):
     still = np.zeros_like(drive.x)
     with pytest.raises(BadInputError, match="rate_hz"):

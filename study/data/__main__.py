@@ -70,9 +70,13 @@ _frames_command("preview", "Draw frames and an animated drive, beside the frame 
 @data.command("import")
 @click.argument("folder", metavar="DIR", type=Path)
 @click.option("--out", type=Path, metavar="FOLDER", help="where the adapted drives go [data/imported/<name of DIR>]")
-def import_(folder: Path, out: Path | None) -> int:
+@click.option("--check", is_flag=True, help="print all that is wrong, and import nothing")
+@click.option("--drop-bad", is_flag=True, help="leave out what is bad, and say how much")
+def import_(folder: Path, out: Path | None, check: bool, drop_bad: bool) -> int:  # noqa: FBT001
     """Check and adapt the Episodes in DIR, so that `study.sweep NAME --data FOLDER` can use them."""
-    return int(resolve_name("study.data.commands:import_folder")(folder, out, HERE))
+    if check:
+        return int(resolve_name("study.data.commands:check_folder")(folder))
+    return int(resolve_name("study.data.commands:import_folder")(folder, out, HERE, drop_bad))
 
 
 def main(args: Sequence[str]) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,8 @@ from study.data.preview import write_preview
 from study.engine.flows import run_flow
 from study.engine.local import local_engine
 from study.episode.imported import open_import
-from study.episode.importing import describe, import_drives
+from study.episode.importing import check_drives, describe, import_drives
+from study.errors import EXIT_BAD_INPUT
 from study.stages import Flow, data_cost, recording_cost
 
 
@@ -44,12 +46,24 @@ def build(show: str, settings: StudySettings, workers: int, workspace: Workspace
     return 0
 
 
-def import_folder(folder: Path, out: Path | None, workspace: Workspace) -> int:
+def import_folder(folder: Path, out: Path | None, workspace: Workspace, drop_bad: bool = False) -> int:  # noqa: FBT001, FBT002
     """Import the Episodes in a folder, and print what became of them. Returns exit code 0."""
-    imported = import_drives(folder, out or workspace.data / "imported" / folder.resolve().name)
+    out = out or workspace.data / "imported" / folder.resolve().name
+    imported = import_drives(folder, out, drop_bad, tell=lambda text: print(text, file=sys.stderr))
     print(describe(imported))
     print(imported.folder)
     return 0
+
+
+def check_folder(folder: Path) -> int:
+    """Print all that is wrong with the Episodes in a folder. Returns exit code 0 where an import would take them."""
+    errors = warnings = 0
+    for finding in check_drives(folder):
+        print(f"warning: {finding}" if finding.warning else str(finding))
+        warnings += finding.warning
+        errors += not finding.warning
+    print(f"{errors} findings, {warnings} warnings")
+    return EXIT_BAD_INPUT if errors else 0
 
 
 def _run(flow: Flow[Any], title: str, seconds: float, workers: int, workspace: Workspace) -> Any:

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from study.config.settings import DynamicsSettings
+from study.episode.motion import wrap
 from study.episode.schema import RATE_HZ, Episode
 from study.errors import BadInputError
 
@@ -36,7 +37,6 @@ BRAKING, STRONG = -0.5, 1.2  # [m/s2]: the town's throttle gives at most 1.0 at 
 STANDING = 0.1  # [m/s]
 OFF_ROUTE = 10.0  # farther than this from its route, an agent has left it [m]
 SLACK = 5.0  # largest difference of progress from the distance moved [m]
-ASKEW = 0.4  # more than this between heading and motion at a quarter of all moments is another convention [rad]
 
 Floats = NDArray[np.float32]
 Bools = NDArray[np.bool_]
@@ -59,9 +59,8 @@ class Adapted:
 def adapt(episode: Episode, source: str) -> Adapted:
     """Return the Episode at 10 Hz with commands and progress filled in (see above); `source` names it in errors.
 
-    Raises BadInputError when headings do not fit the motion, and for rates below 2 Hz.
+    Raises BadInputError for rates below 2 Hz.
     """
-    _check_headings(episode, source)
     original = {"rate_hz": episode.rate_hz, "labels": episode.labels, "digest": episode.digest}
     complete = _fill_progress(_resample(episode, source))
     return _fill_commands(dataclasses.replace(complete, source=episode.source | {"imported": original}, digest=""))
@@ -69,28 +68,6 @@ def adapt(episode: Episode, source: str) -> Adapted:
 
 def _may_be_ego(episode: Episode) -> Bools:
     return np.array([agent.ego for agent in episode.agents], bool)
-
-
-def _wrap(angle: NDArray[Any]) -> NDArray[Any]:
-    """Return the angle, wrapped into half a turn either way."""
-    wrapped: NDArray[Any] = np.mod(angle + np.pi, 2 * np.pi) - np.pi
-    return wrapped
-
-
-def _check_headings(episode: Episode, source: str) -> None:
-    both = episode.present[1:] & episode.present[:-1] & (episode.speed[:-1] > 2 * CREEP)
-    with np.errstate(invalid="ignore"):
-        motion = np.arctan2(np.diff(episode.y, axis=0), np.diff(episode.x, axis=0))
-        off = np.where(both, np.abs(_wrap(motion - episode.heading[:-1])), 0)
-    if not both.any() or np.quantile(off[both], 0.75) <= ASKEW:
-        return
-    step, column = np.unravel_index(int(off.argmax()), off.shape)
-    row = int(episode.present.reshape(-1)[: step * off.shape[1] + column].sum())
-    raise BadInputError(
-        f"{source}: states.parquet, row {row}, field 'heading' (step {step}, agent {episode.agents[column].id}): "
-        f"{episode.heading[step, column]:.3g} does not fit the motion, which goes to {motion[step, column]:.3g}; "
-        "headings are radians, anticlockwise from the x axis"
-    )
 
 
 # --- rate -----------------------------------------------------------------------------------------------------------
@@ -118,12 +95,12 @@ def _resample(episode: Episode, source: str) -> Episode:
         filled: Floats = np.where(np.isfinite(mean), mean, first).astype(np.float32)
         return filled
 
-    heading = episode.heading[before] + _wrap(episode.heading[after] - episode.heading[before])
+    heading = episode.heading[before] + wrap(episode.heading[after] - episode.heading[before])
     same_light = episode.light[before] == episode.light[after]
     changes: dict[str, Any] = {name: between(getattr(episode, name)) for name in ("x", "y", "speed", "route_s")}
     changes |= {name: getattr(episode, name)[before] for name in ("steering", "acceleration", "light", "light_state")}
     changes |= {
-        "heading": _wrap(between(episode.heading, heading)).astype(np.float32),
+        "heading": wrap(between(episode.heading, heading)).astype(np.float32),
         "lead_gap": between(episode.lead_gap),
         "light_distance": between(
             episode.light_distance, np.where(same_light, episode.light_distance[after], np.float32(np.nan))
@@ -166,7 +143,7 @@ def derived_commands(episode: Episode) -> tuple[Floats, Floats]:
     with np.errstate(divide="ignore", invalid="ignore"):
         seconds = (last - first) / episode.rate_hz
         columns = np.broadcast_to(np.arange(len(episode.agents)), first.shape)
-        turned = _wrap(episode.heading[last, columns] - episode.heading[first, columns].astype(np.float64)) / seconds
+        turned = wrap(episode.heading[last, columns] - episode.heading[first, columns].astype(np.float64)) / seconds
         change = (episode.speed[last, columns].astype(np.float64) - episode.speed[first, columns]) / seconds
         length = np.array([agent.length for agent in episode.agents])
         speed = (episode.speed[last, columns].astype(np.float64) + episode.speed[first, columns]) / 2

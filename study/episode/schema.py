@@ -13,14 +13,15 @@ An Episode is a folder of four files. Right-handed coordinates: x east, y north 
     digests         {file name: sha256} of the other three files
 `map.json`
     lanes           [{"id", "centre": [[x, y], ...], "width", "left", "right", "junction", "speed_limit"}]
-                    centre in driving direction; left, right: "none", "dashed", "solid" or "curb"; limit [m/s] or null
+                    centre in driving direction; left, right: "none", "dashed", "solid" or "curb"; limit [m/s] or null;
+                    of points [x, y, height] the height is left out
     lights          [{"id", "stop_line": [[x, y], [x, y]], "lane"}]: lane is the id of the governed lane or null
-`states.parquet`    one row for each agent at each step at which it exists, sorted by step, then agent
+`states.parquet`    one row for each agent at each step at which it exists, in any order (we write: step, then agent)
     step, agent     int32
     x, y            float32 [m], centre of the agent's box (keep |x|, |y| below 10 km: shift the origin)
     heading         float32 [rad]
-    speed           float32 [m/s]
-    steering        float32, positive to the left, null where unknown
+    speed           float32 [m/s], negative when reversing
+    steering        float32, angle of the front wheels over 1.22 rad, -1 to 1, positive to the left, null where unknown
     acceleration    float32, one of -1, 0.5, 1, null where unknown
     light           int32, id of the next light on the agent's route, -1 where none
     light_distance  float32 [m] along the route to its stop line, null where none
