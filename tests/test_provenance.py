@@ -6,10 +6,20 @@ import os
 import platform
 import shutil
 import subprocess
+from dataclasses import replace
 
 import pytest
 
-from study.compute.provenance import DIFF_LIMIT, ROOT, cores, provenance
+from study.compute.provenance import DIFF_LIMIT, ROOT, cores, provenance, warn_of_unknown_origin
+from study.config.grid import Grid
+from study.report.document import plain
+from study.report.markdown import markdown
+from study.report.summary import summarise
+from study.report.text import document
+from study.tracking.metrics import known
+from tests.support.synthetic_records import World, simulate
+
+RECORD = simulate(Grid(name="pair", title="T", heads=("rec", "full"), policy_seeds=3, baselines=()), World(epochs=6))
 
 
 def git(folder, *words):
@@ -31,7 +41,7 @@ def checkout(tmp_path):
 def test_a_clean_checkout_is_its_commit(checkout):
     facts = provenance(checkout)
     assert facts["commit"] == git(checkout, "rev-parse", "HEAD").stdout.strip()
-    assert (facts["dirty"], facts["diff"], facts["diff_digest"]) == (False, "", None)
+    assert (facts["dirty"], facts["unknown"], facts["diff"], facts["diff_digest"]) == (False, None, "", None)
     assert len(facts["lock"]) == 64
 
 
@@ -62,7 +72,8 @@ def test_a_huge_diff_is_cut_and_says_so(checkout):
 
 def test_outside_a_checkout_the_rest_is_known(tmp_path):
     facts = provenance(tmp_path)
-    assert (facts["commit"], facts["lock"], facts["diff"]) == (None, None, "")
+    assert (facts["commit"], facts["dirty"], facts["lock"], facts["diff"]) == (None, None, None, "")
+    assert facts["unknown"] == "the code is no git checkout"
     assert facts["packages"]["numpy"]
     assert facts["cores"] >= 1
 
@@ -75,13 +86,54 @@ def test_a_copy_made_by_git_archive_knows_its_commit(checkout, tmp_path_factory)
     copy = tmp_path_factory.mktemp("copy")
     git(checkout, "archive", "--output", str(copy / "code.tar"), "HEAD")
     shutil.unpack_archive(copy / "code.tar", copy)
-    assert provenance(copy)["commit"] == provenance(checkout)["commit"]
+    facts = provenance(copy)
+    assert facts["commit"] == provenance(checkout)["commit"]
+    assert facts["dirty"] is None  # it may have been changed since
 
 
 def test_a_checkout_around_the_code_is_not_its_own(checkout):
     (checkout / "study" / "a.py").write_text("A = 2\n")
     facts = provenance(checkout / "study")
-    assert (facts["commit"], facts["dirty"]) == (None, False)
+    assert (facts["commit"], facts["dirty"]) == (None, None)
+    assert "not its own" in facts["unknown"]
+
+
+FAKES = {  # what stands in the place of git -> the reason
+    "missing": (None, "git is not installed"),
+    "of another user": ("echo \"fatal: detected dubious ownership in repository at '/home/me'\" >&2; exit 128", "safe"),
+    "damaged": ("echo 'fatal: bad object in /home/me/.git/objects' >&2; exit 128", "bad object in ..."),
+    "silent": ("exit 1", "git refused: no reason"),
+}
+
+
+@pytest.mark.parametrize(("script", "reason"), FAKES.values(), ids=FAKES.keys())
+def test_where_git_does_not_tell_commit_and_changes_are_unknown_with_the_reason(
+    script, reason, checkout, tmp_path_factory, monkeypatch, capsys
+):
+    programs = tmp_path_factory.mktemp("programs")
+    if script:
+        (programs / "git").write_text(f"#!/bin/sh\n{script}\n")
+        (programs / "git").chmod(0o755)
+    monkeypatch.setenv("PATH", str(programs))
+    facts = provenance(checkout)
+    assert (facts["commit"], facts["dirty"], facts["diff"]) == (None, None, "")
+    assert reason in facts["unknown"]
+    assert "/home" not in facts["unknown"]
+    warn_of_unknown_origin(checkout)
+    assert "warning: the commit is unknown" in capsys.readouterr().err
+    assert known(facts, "commit") == known(facts, "dirty") == f"unknown: {facts['unknown']}"
+    text = markdown(document(summarise(replace(RECORD, provenance=RECORD.provenance | facts))))
+    assert text.count(str(plain(facts["unknown"]))) == 2
+    assert "Commit unknown" in text
+
+
+def test_a_known_commit_is_told_without_a_warning(checkout, capsys):
+    warn_of_unknown_origin(checkout)
+    assert capsys.readouterr().err == ""
+    facts = provenance(checkout)
+    assert (known(facts, "commit"), known(facts, "dirty")) == (facts["commit"], "false")
+    text = markdown(document(summarise(replace(RECORD, provenance=RECORD.provenance | facts))))
+    assert "unknown" not in text.partition("## Summary")[0]
 
 
 def test_no_user_or_host_name_is_recorded(checkout):

@@ -3,6 +3,7 @@
 import http.server
 import json
 import os
+import platform
 import shutil
 import socket
 import sqlite3
@@ -461,6 +462,27 @@ def test_what_a_killed_sweep_left_running_is_closed_by_the_next(tracker):
     run = start(tracker, sweep, planned, "killed-0")
     after = open_sweep(tracker, others)
     assert (status(tracker, sweep), status(tracker, run.run_id), status(tracker, after)) == (*["KILLED"] * 2, "RUNNING")
+
+
+def test_a_sweep_that_lives_in_another_process_or_on_another_machine_is_left_alone(tracker):
+    """One that goes through a server on the same file holds another lock."""
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as other:
+        now = str(time.time_ns() // 1_000_000 - 200_000)  # its clock is three minutes behind
+        lives = {"one": {"host": platform.node(), "process": str(other.pid)}, "two": {"host": "far", "process": "1"}}
+        runs = {}
+        for name, tags in lives.items():
+            planned = cells(name)
+            sweep = open_sweep(tracker, planned, profile=name)
+            run = start(tracker, sweep, planned, f"{name}-0").run_id
+            for key, value in (tags | {"alive": now}).items():
+                tracker.client.set_tag(sweep, key, value)
+                tracker.client.set_tag(run, key, value)
+            runs[name] = sweep, run
+            assert {status(tracker, run) for pair in runs.values() for run in pair} == {"RUNNING"}
+        other.communicate(b"\n")
+    tracker.client.set_tag(runs["two"][1], "alive", "1000")
+    open_sweep(tracker, cells("three"))
+    assert {status(tracker, run) for pair in runs.values() for run in pair} == {"KILLED"}
 
 
 def test_closing_a_sweep_leaves_nothing_running(tracker):

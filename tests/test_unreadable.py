@@ -65,7 +65,7 @@ def store(finished):
 
 def test_a_sweep_to_compare_with_that_cannot_be_read_is_named_and_the_report_is_written(store, tmp_path, capsys):
     tracker, varied, _ = store
-    assert set(complete_cells(tracker, "pair", None).variants) == {"frames.split"}
+    assert set(complete_cells(tracker.reader, "pair", None).variants) == {"frames.split"}
     shutil.rmtree(artifacts(tracker, varied))
     publish(tracker, "pair", None, tmp_path)
     report = read_report(tmp_path / "pair")
@@ -79,11 +79,11 @@ def test_a_sweep_to_compare_with_that_cannot_be_read_is_named_and_the_report_is_
 def test_a_plan_of_any_content_breaks_no_other_report(store, content):
     tracker, varied, _ = store
     (artifacts(tracker, varied) / "plan.json").write_bytes(content)
-    record = complete_cells(tracker, "pair", None)
+    record = complete_cells(tracker.reader, "pair", None)
     assert len(record.results) == 2
     assert record.variants == {}
     with pytest.raises(BadInputError, match=varied):
-        complete_cells(tracker, "varied", None)
+        complete_cells(tracker.reader, "varied", None)
 
 
 def test_a_run_that_was_killed_before_its_plan_was_stored_leaves_the_earlier_sweep_of_its_name(store):
@@ -115,7 +115,7 @@ def test_a_cell_whose_result_is_gone_is_named_and_the_others_are_reported(store)
     key, gone = next(iter(tracker.reader.read_sweep("pair").planned.items()))
     cell_run = tracker.reader.finished([key])[key]
     shutil.rmtree(artifacts(tracker, cell_run))
-    report = summarise(complete_cells(tracker, "pair", None))
+    report = summarise(complete_cells(tracker.reader, "pair", None))
     assert [failure.cell for failure in report.sweep.failed] == [gone.label]
     assert [cell_run in line for line in report.unread] == [True]
     assert len(report.scores) == 1

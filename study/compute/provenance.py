@@ -14,13 +14,31 @@ import platform
 import re
 import shutil
 import subprocess
+import sys
 import tempfile
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 DIFF_LIMIT = 1_000_000  # bytes
+REFUSALS = {  # words of git's -> what they mean
+    "not a git repository": "the code is no git checkout",
+    "dubious ownership": "git refuses a checkout of another user; allow it: git config --global --add safe.directory "
+    "FOLDER",
+}
 NEW_FILES = ("study", "sweeps", "tests", "benchmarks")  # elsewhere a new file may be a secret or a data set
+
+
+class _UnknownError(Exception):
+    """Git does not tell what computes here; the text is the reason."""
+
+
+def warn_of_unknown_origin(root: Path = ROOT) -> None:
+    """Say on stderr when the results will not be able to say which code has made them."""
+    origin = provenance(root)
+    if origin["unknown"]:
+        what = "whether the code was changed" if origin["commit"] else "the commit"
+        print(f"warning: {what} is unknown, and results will say so: {origin['unknown']}", file=sys.stderr)
 
 
 def provenance(root: Path = ROOT) -> dict[str, Any]:
@@ -28,19 +46,26 @@ def provenance(root: Path = ROOT) -> dict[str, Any]:
 
     And when it was asked: `time`, in UTC to the second.
 
-    Outside a git checkout `commit` is the one that `git archive` wrote down or None, `dirty` False and `diff` empty;
+    What git cannot tell is None, and `unknown` says why: `commit` (unless `git archive` wrote it down) and `dirty`;
     `lock` is the sha256 of requirements.lock or None, `diff_digest` that of the diff or None. A diff beyond 1 MB is
     cut, and says so in its last line.
     """
-    # A commit counts only when `root` is the top of its checkout.
-    below, _, head = _git(root, "rev-parse", "--show-prefix", "HEAD").partition("\n")
-    commit = "" if below else head.strip()
-    diff = _diff(root) if commit else ""
+    commit, dirty, diff, unknown = _archived(root), None, "", None
+    try:
+        below, _, head = _git(root, "rev-parse", "--show-prefix", "HEAD").partition("\n")
+        if below:  # a commit counts only when `root` is the top of its checkout
+            raise _UnknownError("the code lies inside a checkout that is not its own")  # noqa: TRY301 - one way out
+        commit = head.strip()
+        diff = _diff(root)
+        dirty = bool(diff)
+    except _UnknownError as error:
+        unknown = str(error)
     lock = root / "requirements.lock"
     return {
         "time": dt.datetime.now(dt.UTC).isoformat(timespec="seconds"),
-        "commit": commit or _archived(root),
-        "dirty": bool(diff),
+        "commit": commit,
+        "dirty": dirty,
+        "unknown": unknown,
         "diff": diff,
         "diff_digest": hashlib.sha256(diff.encode()).hexdigest() if diff else None,
         "lock": hashlib.sha256(lock.read_bytes()).hexdigest() if lock.is_file() else None,
@@ -83,19 +108,32 @@ def _archived(root: Path) -> str | None:
 
 
 def _git(root: Path, *words: str, **environment: str) -> str:
-    """Return git's answer, cut at DIFF_LIMIT bytes; empty where git or the repository is missing."""
+    """Return git's answer, cut at DIFF_LIMIT bytes. Raises _UnknownError with the reason when it gives none."""
     try:
         git = subprocess.run(
             ["git", "-C", str(root), *words],
-            env={**os.environ, "GIT_OPTIONAL_LOCKS": "0", **environment},
+            env={**os.environ, "GIT_OPTIONAL_LOCKS": "0", "LC_ALL": "C", **environment},
             capture_output=True,
             check=True,
             timeout=30,
         )
-    except (OSError, subprocess.SubprocessError):
-        return ""
+    except FileNotFoundError:
+        raise _UnknownError("git is not installed") from None
+    except subprocess.CalledProcessError as error:
+        raise _UnknownError(_reason(error.stderr.decode("utf-8", errors="replace"))) from None
+    except (OSError, subprocess.SubprocessError) as error:
+        raise _UnknownError(f"git gave no answer ({type(error).__name__})") from None
     text = git.stdout[:DIFF_LIMIT].decode("utf-8", errors="replace")
     return text if len(git.stdout) <= DIFF_LIMIT else f"{text}\n[cut: {len(git.stdout)} bytes in all]\n"
+
+
+def _reason(words: str) -> str:
+    """Return why git has refused, without the names of folders: results are passed on."""
+    for part, reason in REFUSALS.items():
+        if part in words:
+            return reason
+    line = (words.strip().splitlines() or ["no reason"])[0]
+    return f"git refused: {re.sub(r'/[^ ]*', '...', line)[:200]}"
 
 
 def _diff(root: Path) -> str:
@@ -107,5 +145,6 @@ def _diff(root: Path) -> str:
             shutil.copyfile(index, draft)
         new = [name for name in NEW_FILES if (root / name).is_dir()]
         if new:
-            _git(root, "add", "--intent-to-add", "--", *new, GIT_INDEX_FILE=str(draft))
+            with contextlib.suppress(_UnknownError):  # a folder that the checkout ignores
+                _git(root, "add", "--intent-to-add", "--", *new, GIT_INDEX_FILE=str(draft))
         return _git(root, "diff", "--no-color", "--no-ext-diff", "HEAD", "--", ".", GIT_INDEX_FILE=str(draft))

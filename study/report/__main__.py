@@ -29,10 +29,11 @@ def report(name: str, profile: str | None, kind: str, out: Path, tracking: str) 
 
     With --format md, print the report without figures as Markdown.
     """
-    tracker = resolve_name("study.tracking.tracker:Tracker")(tracking)
+    reader = resolve_name("study.tracking.reader:Reader").existing(tracking)
     if kind == "md":
-        print(resolve_name("study.report.build:report_as_markdown")(tracker, name, profile), end="")
+        print(resolve_name("study.report.build:report_as_markdown")(reader, name, profile), end="")
     else:
+        tracker = resolve_name("study.tracking.tracker:Tracker")(tracking)  # the report becomes part of the run
         print(resolve_name("study.report.build:publish")(tracker, name, profile, out))
     return 0
 

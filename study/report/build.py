@@ -23,6 +23,7 @@ from study.report.model import Report, read_report
 from study.report.summary import summarise
 from study.report.text import document
 from study.results.sweep_record import SweepRecord
+from study.tracking.reader import Reader
 from study.tracking.tracker import Tracker
 from study.tracking.variants import with_variants
 
@@ -63,24 +64,24 @@ def typeset(title: str, footer: str, blocks: Sequence[Block], pictures: dict[str
 
 def publish(tracker: Tracker, name: str, profile: str | None, folder: Path) -> Path:
     """Build the report from the tracker alone, and add it to the sweep's run. Returns the PDF's path."""
-    record = complete_cells(tracker, name, profile)
+    record = complete_cells(tracker.reader, name, profile)
     pdf, files = build_report(record, folder), folder / name
     tracker.log_files(record.run_id, [pdf, files / "report.json", files / "curves.parquet"], "report")
     tracker.log_files(record.run_id, sorted((files / "figures").glob("*")), "figures")
     return pdf
 
 
-def complete_cells(tracker: Tracker, name: str, profile: str | None) -> SweepRecord:
+def complete_cells(reader: Reader, name: str, profile: str | None) -> SweepRecord:
     """Return a sweep with those that vary one of its confounds; say on stderr what cannot be read."""
-    record = with_variants(tracker.reader, tracker.reader.read_sweep(name, profile))
+    record = with_variants(reader, reader.read_sweep(name, profile))
     for line in record.unread:
         print(f"left out of the report: {line}", file=sys.stderr)
     return record
 
 
-def report_as_markdown(tracker: Tracker, name: str, profile: str | None) -> str:
+def report_as_markdown(reader: Reader, name: str, profile: str | None) -> str:
     """Return the report of a sweep as Markdown, without figures."""
-    return markdown(document(summarise(complete_cells(tracker, name, profile))))
+    return markdown(document(summarise(complete_cells(reader, name, profile))))
 
 
 def side_by_side(first: str, second: str, tracking: str, figure: Path | None = None) -> str:
@@ -116,4 +117,4 @@ def _report(source: str, tracking: str) -> Report:
     if Path(source).exists() or "/" in sweep or sweep.endswith(".json"):
         return read_report(Path(source))
     name, _, profile = sweep.partition(":")
-    return summarise(Tracker(uri or tracking).reader.read_sweep(name, profile or None))
+    return summarise(Reader.existing(uri or tracking).read_sweep(name, profile or None))

@@ -25,6 +25,7 @@ from study.report.model import Report, Score, Spread
 from study.report.rounding import NOTHING, UNITS, between, epochs, fixed, interval, percent, show
 from study.report.text import counts, render, title
 
+CHANGES = {True: " with uncommitted changes", False: "", None: ", whether changed is unknown"}
 Rows = list[list[object]]
 Sides = tuple[Report, Report]
 
@@ -114,7 +115,7 @@ def _facts(report: Report) -> Iterator[tuple[str, str]]:
     for name, value in sweep.items():
         yield f"sweep {name}", ", ".join(value) if isinstance(value, tuple) else str(value)
     yield "sweep cells", ", ".join(row.cell for row in report.scores)
-    yield "commit", f"{origin.commit or 'unknown'}{' with uncommitted changes' * bool(origin.dirty)}"
+    yield "commit", f"{origin.commit or 'unknown'}{CHANGES[origin.dirty]}"
     yield "data key", str(report.data.key)
     for name, content in report.data.sets.items():
         for count in ("frames", "drives", "test_drives"):

@@ -207,11 +207,13 @@ class Provenance(Part):
     """Where the numbers come from; `cell_commits` has several entries where cells come from different commits.
 
     `cell_times`: when the first and the last cell began, in UTC, of those whose results say so; `undated`: how many do
-    not. `computed_on`: the machines of the cells, with Python and torch, where one is not the client's.
+    not. `computed_on`: the machines of the cells, with Python and torch, where one is not the client's. `unknown`: why
+    commit or dirty is None.
     """
 
     commit: str | None
     dirty: bool | None
+    unknown: str | None = None
     lock: str | None
     python: str | None
     platform: str | None

@@ -51,6 +51,7 @@ from study.stages import RESULT_BYTES, data_cost
 
 SHOWN_PACKAGES = ("torch", "lightning", "highway-env", "gymnasium", "numpy", "scipy", "mlflow", "optuna", "typst")
 SIMULATOR = "a town of our own on highway-env, in the place of CARLA's Town03"
+ORIGIN = ("commit", "dirty", "unknown")
 NEAR = 30.0  # [m] a lead vehicle farther away may be outside the image
 
 
@@ -324,7 +325,10 @@ def _provenance(record: SweepRecord) -> Provenance:
     devices = [result.facts.get("device") for result in record.results.values()]
     machines = {_machine(each, device) for each, device in zip(origins, devices, strict=True) if each.get("cpu")}
     return Provenance(
-        **{name: origin.get(name) for name in ("commit", "dirty", "lock", "python", "platform", "cpu", "cores")},
+        **{
+            name: origin.get(name)
+            for name in ("commit", "dirty", "unknown", "lock", "python", "platform", "cpu", "cores")
+        },
         diff_lines=len(str(origin.get("diff") or "").splitlines()),
         packages={name: packages[name] for name in SHOWN_PACKAGES if name in packages},
         cell_commits=tuple(sorted(str(commit) for commit in commits if commit)),

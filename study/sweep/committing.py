@@ -25,7 +25,7 @@ from study.stages import Flow
 from study.sweep.options import RunOptions
 from study.sweep.plan import Plan, cell_jobs
 from study.tracking.cell_run import CellRun
-from study.tracking.experiment import SQLITE, DeletedError, TrackerLostError
+from study.tracking.experiment import DeletedError, TrackerLostError, database_file
 from study.tracking.tracker import Tracker
 
 PATIENCE, RETRY = 600.0, 3.0  # [s] a lost server is waited for, and between two tries
@@ -203,6 +203,5 @@ def _score(result: CellResult) -> float:
 
 def store_folder(workspace: Workspace, tracking: str) -> Path:
     """Return where the lock and Optuna's file of a tracking store lie: beside a database file, else in mlruns/."""
-    if tracking.startswith(SQLITE):
-        return Path(tracking.removeprefix(SQLITE).partition("?")[0]).parent
-    return workspace.mlruns
+    database = database_file(tracking)
+    return database.parent if database else workspace.mlruns

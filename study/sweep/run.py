@@ -15,7 +15,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from study.compute.gpus import visible_gpus
-from study.compute.provenance import cores, provenance
+from study.compute.provenance import cores, provenance, warn_of_unknown_origin
 from study.config.workspace import Workspace
 from study.data.card import card_files, source_drives
 from study.data.frames import open_frames
@@ -37,6 +37,7 @@ from study.tracking.tracker import Tracker
 
 def execute(plan: Plan, options: RunOptions, command: str, *, report: bool) -> int:
     """Run what is not finished, then write the report unless told not to. Returns the exit code."""
+    warn_of_unknown_origin()
     with hold_store(plan, options.tracking, wait=options.wait):
         tracker = Tracker(options.tracking)
         failed = run_cells(plan, options, tracker)

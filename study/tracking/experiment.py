@@ -27,6 +27,7 @@ from sqlalchemy.exc import SQLAlchemyError  # MLflow depends on sqlalchemy and l
 from study.config.workspace import HERE
 from study.errors import BadInputError, masked
 from study.tracking.run_page import experiment_tags
+from study.tracking.schema import has_tables
 
 SQLITE = "sqlite:///"
 SCHEMES = (SQLITE, "http://", "https://", "postgresql://", "postgresql+psycopg2://", "postgresql+psycopg://")
@@ -129,6 +130,8 @@ def find_experiment(uri: str, name: str) -> Experiment | None:
     database = database_file(uri)
     if database and not database.exists():
         return None
+    if not uri.startswith("http") and not _checked(uri, masked(uri), database):
+        return None
     client, shown, artifacts = _connect(uri)
     with guard(shown, opening=True), few_tries():
         entity = client.get_experiment_by_name(name)
@@ -137,7 +140,7 @@ def find_experiment(uri: str, name: str) -> Experiment | None:
 
 def database_file(uri: str) -> Path | None:
     """Return the file of a SQLite store, or None for another kind."""
-    return Path(uri.removeprefix(SQLITE).partition("?")[0]).absolute() if uri.startswith(SQLITE) else None
+    return Path(uri.removeprefix(SQLITE).partition("?")[0]).resolve() if uri.startswith(SQLITE) else None
 
 
 @contextmanager
@@ -196,6 +199,7 @@ def _connect(uri: str) -> tuple[MlflowClient, str, Path | None]:
     elif uri.startswith("http"):
         _probe(uri, shown)
     else:
+        _checked(uri, shown, None)
         artifacts = HERE.mlruns.absolute() / "artifacts"
     with guard(shown, opening=True), few_tries(BUSY):
         return MlflowClient(uri), shown, artifacts
@@ -234,19 +238,35 @@ def _probe(uri: str, shown: str) -> None:
 
 
 def _prepare_database(database: Path, shown: str) -> None:
-    """Create the file where it is missing; refuse one that is not MLflow's."""
-    try:
-        if not database.exists():
+    """Create the file where it is missing; refuse one that is not MLflow's or of another version of it."""
+    if not database.exists():
+        with _usable_database(shown, database):
             create_database(database)
-        with sqlite3.connect(f"{database.as_uri()}?mode=ro", uri=True, timeout=20) as connection:
-            tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
-        connection.close()
+    _checked(f"{SQLITE}{database}", shown, database)
+
+
+def _checked(uri: str, shown: str, database: Path | None) -> bool:
+    """Return whether a database has MLflow's tables. Raises BadInputError when it cannot be used as it is."""
+    if not uri.startswith(SCHEMES) or uri == SQLITE:
+        return True  # `_connect` refuses it
+    with _usable_database(shown, database):
+        return has_tables(uri, shown, database)
+
+
+@contextmanager
+def _usable_database(shown: str, database: Path | None) -> Iterator[None]:
+    """Turn errors of a database into one that says what to do."""
+    if database is None:
+        with guard(shown, opening=True):
+            yield
+        return
+    try:
+        yield
     except (OSError, sqlite3.Error, SQLAlchemyError, MlflowException) as error:
+        reason = getattr(error, "orig", None) or error
         raise BadInputError(
-            f"{shown} cannot be used as a tracking store: {error}; move the file away or give another --tracking"
+            f"{shown} cannot be used as a tracking store: {reason}; move the file away or give another --tracking"
         ) from None
-    if not {"experiments", "runs"} <= tables:
-        raise BadInputError(f"{shown} is a database, but not MLflow's; give another file with --tracking")
 
 
 def create_database(database: Path) -> None:

@@ -64,10 +64,20 @@ def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
+def known(origin: Mapping[str, Any], name: str) -> str:
+    """Return what provenance says of `commit` or `dirty`, or "unknown" with the reason."""
+    value = origin.get(name)
+    if value is None:
+        return f"unknown: {origin['unknown']}" if origin.get("unknown") else "unknown"
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
 def describe_facts(facts: Mapping[str, Any]) -> tuple[dict[str, float], dict[str, str]]:
     """Return a cell's facts as metrics such as `seconds/encoder`, and as tags."""
     origin = facts.get("provenance", {})
-    words = {COMMIT: origin.get("commit"), **{name: origin.get(name) for name in ORIGIN}}
+    words = {name: origin.get(name) for name in ORIGIN}
+    if origin:
+        words |= {COMMIT: known(origin, "commit"), "dirty": known(origin, "dirty")}
     numbers: dict[str, float] = {}
     for name, value in flatten({name: value for name, value in facts.items() if name != "provenance"}).items():
         if isinstance(value, int | float):

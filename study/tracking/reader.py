@@ -15,7 +15,7 @@ from mlflow.entities import Run
 from study.config.grid import Cell, Grid
 from study.config.settings import StudySettings
 from study.config.workspace import HERE
-from study.errors import BadInputError
+from study.errors import BadInputError, masked
 from study.results.cell_result import CellResult
 from study.results.sweep_record import SweepRecord
 from study.tracking.experiment import Experiment, TrackerLostError, UnreadableError, find_experiment
@@ -47,6 +47,13 @@ class Reader:
         """Return a reader, or None where nothing was tracked yet, and create nothing."""
         opened = find_experiment(uri, experiment)
         return cls(opened) if opened else None
+
+    @classmethod
+    def existing(cls, uri: str = HERE.tracking) -> Self:
+        """Return a reader, and create nothing. Raises BadInputError where nothing was tracked yet."""
+        if reader := cls.look(uri):
+            return reader
+        raise BadInputError(f"nothing was tracked in {masked(uri)} yet; run a sweep, or name its store with --tracking")
 
     def finished(self, keys: Collection[str]) -> dict[str, str]:
         """Return key -> run id of the cells that are done; of several runs of one key, the first that was done."""

@@ -1,0 +1,34 @@
+"""One sweep at a time writes to a database, whatever folder it works in and however it names the file."""
+
+import os
+from dataclasses import replace
+
+import pytest
+
+from study.config.workspace import Workspace
+from study.errors import BadInputError
+from study.sweep.run import hold_store
+from tests.support.plans import plan_of
+
+
+@pytest.mark.parametrize("name", ["the same", "a link to the file", "a link to its folder", "relative", "with options"])
+def test_two_working_folders_on_one_database_hold_one_lock(name, tmp_path):
+    store = tmp_path / "store"
+    store.mkdir()
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other/mlflow.db").symlink_to(store / "mlflow.db")
+    (tmp_path / "link").symlink_to(store)
+    uri = f"sqlite:///{store}/mlflow.db"
+    names = {
+        "the same": uri,
+        "a link to the file": f"sqlite:///{tmp_path}/other/mlflow.db",
+        "a link to its folder": f"sqlite:///{tmp_path}/link/mlflow.db",
+        "relative": f"sqlite:///{os.path.relpath(store)}/mlflow.db",
+        "with options": f"{uri}?timeout=60",
+    }
+    plan = plan_of(["heads"])
+    elsewhere = replace(plan, workspace=Workspace(data=tmp_path / "data", mlruns=tmp_path / "mlruns"))
+    with hold_store(plan, uri, wait=False):
+        refused = pytest.raises(BadInputError, match=rf"another sweep, heads \(process {os.getpid()}\), runs on this")
+        with refused, hold_store(elsewhere, names[name], wait=False):
+            pass
