@@ -18,6 +18,7 @@ from tests.support.plans import plan_of
         (["--certificates", "here"], "--certificates goes with --cluster tls://"),
         (["--certificates", "here", "--cluster", "tcp://127.0.0.1:8786"], "--certificates goes with --cluster tls://"),
         (["--device", "cuda:99"], "choose from cpu"),
+        (["--dynamics.lag", "3"], "takes 37 m, and the autopilot looks 30 m ahead"),
     ],
 )
 def test_options_that_cannot_be_used_are_refused_before_anything_runs(words, says):
@@ -27,6 +28,10 @@ def test_options_that_cannot_be_used_are_refused_before_anything_runs(words, say
 
 def test_a_device_of_the_cluster_need_not_be_on_this_machine():
     assert main(["heads", "--device", "cuda:99", "--cluster", "tcp://127.0.0.1:8786", "--dry-run"]) == 0
+
+
+def test_one_baseline_needs_no_brackets():
+    assert plan_of(["heads", "--baselines", "state"]).cells == plan_of(["heads", "--baselines", "[state]"]).cells
 
 
 def test_a_plans_command_makes_the_same_plan():

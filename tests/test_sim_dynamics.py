@@ -97,8 +97,9 @@ def test_the_unit_of_steering_changes_labels_but_not_drives(steering_unit: float
 @pytest.mark.parametrize(
     ("town", "dynamics", "message"),
     [
-        ({}, {"lag": 2.0}, "dynamics.lag: with 2 s, stopping from 40 km/h takes 31 m.* take a lag of at most 1.8 s"),
+        ({}, {"lag": 2.0}, "from 40 km/h with a lag of 2 s takes 31 m.* take a lag of at most 1.8 s"),
         ({"road_limits": LIMITS}, {"lag": 0.8}, "from 50 km/h .* looks 30 m ahead; .* or limits of at most 4"),
+        ({"road_limits": [90]}, {}, "from 90 km/h .* ahead; take limits of at most 60 km/h"),
         ({}, {"wheel_lag": 0.5}, "dynamics.wheel_lag: with 0.5 s, vehicles leave their lanes"),
     ],
 )

@@ -14,7 +14,7 @@ from study.episode.checks import check_episode
 from study.episode.files import read_episode
 from study.episode.schema import Episode
 from study.errors import BadInputError
-from study.sim.autopilot import LOOK
+from study.sim.dynamics import LOOK
 from study.sim.record import FORMAT_VERSION, record_episode, record_flow
 
 TOWN = TownSettings(vehicles=30)
@@ -153,7 +153,7 @@ def test_recordings_that_cannot_be_are_refused(tmp_path: Path) -> None:
         record_episode(TINY, AT_ONCE, RecordingSettings(warm_up=0, duration=0.01), 0)
     with pytest.raises(
         BadInputError,
-        match=r"dynamics.lag: with 3 s, stopping from 45 km/h takes .* looks 30 m ahead; take a lag of at most",
+        match=r"stopping from 45 km/h with a lag of 3 s takes .* looks 30 m ahead; take a lag of at most",
     ):
         run_flow(
             record_flow(TownSettings(speed_limit=45.0, road_limits=()), DynamicsSettings(lag=3), SHORT, [0], tmp_path)

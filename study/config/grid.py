@@ -16,7 +16,8 @@ from study.config.settings import Count, NotNegative, Positive, Settings, Share
 from study.errors import BadInputError
 
 Fraction = Annotated[float, Field(gt=0, le=1)]
-OneOrMore = BeforeValidator(lambda value: value if isinstance(value, list | tuple) else (value,)), Field(min_length=1)
+Listed = BeforeValidator(lambda value: value if isinstance(value, list | tuple) else (value,))
+OneOrMore = Listed, Field(min_length=1)
 EVERY = "every head set"  # the name under which one number stands for all
 
 
@@ -112,7 +113,7 @@ class Grid(Settings):
     encoder_seeds: Count = Field(1, description="encoders for each head set and fraction")
     policy_seeds: Count = Field(15, description="policies on each encoder (Sec. V-A: 15)")
     reference: str = Field("rec", description="head set that the others are compared with")
-    baselines: tuple[str, ...] = Field(
+    baselines: Annotated[tuple[str, ...], Listed] = Field(
         tuple(BASELINES), description="cells without a head set to compare with (docs/reading-a-report.md); [] for none"
     )
     claims: tuple[str, ...] = Field((), description="claims of the paper that this sweep tests")

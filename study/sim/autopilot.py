@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 from study.config.paper import ACCELERATIONS
 from study.config.settings import DynamicsSettings
 from study.episode.schema import GREEN, RED, YELLOW
-from study.sim.dynamics import BRAKE, DT, stopping_distance
+from study.sim.dynamics import BRAKE, DT, LOOK, stopping_distance
 from study.sim.geometry import LENGTH, WIDTH, Floats, Ints, Pose
 from study.sim.town import Town
 
-LOOK = 30.0  # look-ahead for vehicles on the route [m]
 REACH = LOOK + 8.0  # distance between centres within which lie all vehicles of the look-ahead [m]
 MARGIN = 0.1  # added on both sides of a vehicle when its path is tested [m]
 

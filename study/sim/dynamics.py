@@ -11,6 +11,7 @@ from study.errors import BadInputError
 from study.sim.geometry import Floats
 
 DT = 0.1  # [s]
+LOOK = 30.0  # look-ahead for vehicles on the route [m]
 THROTTLE = {0.5: 1.0, 1.0: 2.5}  # acceleration at rest, which falls with speed [m/s2]
 TOP_SPEED = 25.0  # at which throttle no longer accelerates [m/s]
 BRAKE = 5.0  # [m/s2]
@@ -34,8 +35,8 @@ def stopping_distance(speed: Floats, force: Floats, lag: float) -> Floats:
     return way
 
 
-def check_dynamics(town: TownSettings, dynamics: DynamicsSettings, look: float) -> None:
-    """Raise BadInputError when vehicles cannot keep their lane, or stop from the highest limit within `look` [m]."""
+def check_dynamics(town: TownSettings, dynamics: DynamicsSettings) -> None:
+    """Raise BadInputError when vehicles cannot keep their lane, or stop from the highest limit within LOOK."""
     if dynamics.wheel_lag > MOST_WHEEL_LAG:
         raise BadInputError(
             f"dynamics.wheel_lag: with {dynamics.wheel_lag:g} s, vehicles leave their lanes in turns; "
@@ -48,12 +49,12 @@ def check_dynamics(town: TownSettings, dynamics: DynamicsSettings, look: float) 
         return float(stopping_distance(speed, force, lag)[0] + DT * speed[0])  # and a step until it is seen
 
     fastest = max(town.road_limits or (town.speed_limit,))
-    if way(dynamics.lag, fastest) > look:
-        lags = [tenths / 10 for tenths in range(50) if way(tenths / 10, fastest) <= look]
-        limits = [kmh for kmh in range(1, 200) if way(dynamics.lag, kmh) <= look]
+    if way(dynamics.lag, fastest) > LOOK:
+        lags = [tenths / 10 for tenths in range(50) if way(tenths / 10, fastest) <= LOOK]
+        limits = [kmh for kmh in range(1, 200) if way(dynamics.lag, kmh) <= LOOK]
+        lag = f"a lag of at most {max(lags):g} s (dynamics.lag), or " if lags else ""
         raise BadInputError(
-            f"dynamics.lag: with {dynamics.lag:g} s, stopping from {fastest:g} km/h takes "
-            f"{way(dynamics.lag, fastest):.0f} m, and the autopilot looks {look:g} m ahead; "
-            f"take a lag of at most {max(lags, default=0):g} s, or limits of at most {max(limits, default=0)} km/h "
-            "(town.speed_limit, town.road_limits)"
+            f"town.{'road_limits' if town.road_limits else 'speed_limit'}: stopping from {fastest:g} km/h with a lag "
+            f"of {dynamics.lag:g} s takes {way(dynamics.lag, fastest):.0f} m, and the autopilot looks {LOOK:g} m "
+            f"ahead; take {lag}limits of at most {max(limits, default=0)} km/h"
         )

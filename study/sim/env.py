@@ -16,8 +16,8 @@ from study.config.settings import DynamicsSettings, Model, TownSettings
 from study.episode.schema import GREEN
 from study.errors import BadInputError
 from study.randomness import rng
-from study.sim.autopilot import LOOK, MOST_STEERING, REACH, Decisions, Fleet
-from study.sim.dynamics import BRAKE, DT, THROTTLE, TOP_SPEED, check_dynamics, follow_command
+from study.sim.autopilot import MOST_STEERING, REACH, Decisions, Fleet
+from study.sim.dynamics import BRAKE, DT, LOOK, THROTTLE, TOP_SPEED, check_dynamics, follow_command
 from study.sim.geometry import LENGTH
 from study.sim.lights import LightPlan, plan_lights
 from study.sim.road import TownNetwork, TownRoad, TownVehicle
@@ -265,7 +265,7 @@ def make_traffic(
 
     Raises BadInputError when the settings cannot be met.
     """
-    check_dynamics(settings, dynamics, LOOK)
+    check_dynamics(settings, dynamics)
     light_rng, traffic_rng = (rng(seed, purpose) for purpose in ("lights", "traffic"))
     town = draw_town(settings, rng(seed if settings.per_drive else town_seed, "town"))
     room = sum(town.strips[entry].piece.length for entry in town.ways)

@@ -19,6 +19,7 @@ from study.config.workspace import HERE, Workspace
 from study.console.display import Display
 from study.data.prepare import drives_folder, frames_folder
 from study.episode.imported import Imported, open_import
+from study.sim.dynamics import check_dynamics
 from study.stages import Cost, Work, cell_cost, data_cost
 
 if TYPE_CHECKING:
@@ -103,6 +104,8 @@ def make_plan(
     imported = open_import(data) if data else None
     if imported:
         imported.assign(settings.frames)  # so that too few drives are an error now
+    else:
+        check_dynamics(settings.town, settings.dynamics)
     frames = frames_key(settings, imported.key if imported else None)
     cells = {cell_key(settings, cell, loaded.policy_seeds, frames): cell for cell in loaded.cells()}
     words = ["python", "-m", "study.sweep", name, "--profile", profile, *_given(grid, study)]
