@@ -24,7 +24,8 @@ def one_of(what: str, got: object, allowed: object) -> BadInputError:
 
 
 def masked(text: str) -> str:
-    """Hide the credentials of any URI in a text."""
+    """Hide the credentials of any URI in a text, and write what is no character, as names of files may be, as code."""
+    text = text.encode(errors="backslashreplace").decode()
     text = re.sub(r"(\w://)[^/@\s]*@", r"\1***@", text)
     return re.sub(r"(?i)\b(password=)[^&\s]+", r"\1***", text)
 

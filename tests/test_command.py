@@ -1,6 +1,7 @@
 """The command line: errors are one line and exit code 2, and nothing heavy is loaded to answer --help."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -10,7 +11,7 @@ import pytest
 
 from study.config.baselines import BASELINES
 from study.console.interrupts import STOP_SECONDS, check_stopped, stoppable
-from study.errors import EXIT_AGAIN, EXIT_INTERRUPTED
+from study.errors import EXIT_AGAIN, EXIT_BAD_INPUT, EXIT_INTERRUPTED
 from tests.support.processes import sweep
 from tests.support.sweeps import working_folder
 
@@ -132,3 +133,21 @@ def test_work_that_does_not_ask_is_left_where_it_is():
     assert "To go on: this again" in completed.stderr
     assert "Traceback" not in completed.stderr
     assert STOP_SECONDS <= time.monotonic() - began < 30
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "cp1252", "utf-8"])
+def test_what_the_output_cannot_show_is_a_substitute(encoding):
+    """A title in another script, and the name of a file that is no text at all."""
+    code = (
+        "import sys; from study.console.options import run; from study.errors import BadInputError\n"
+        "def main(words):\n"
+        "    print('95 % — 漢字 \\udcff'); raise BadInputError('no file 漢字 \\udcff')\n"
+        "run(main)"
+    )
+    environment = os.environ | {"PYTHONIOENCODING": encoding}
+    completed = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False, env=environment)
+    assert completed.returncode == EXIT_BAD_INPUT
+    assert completed.stdout.startswith(b"95 % ")
+    assert completed.stderr.startswith(b"error: no file ")
+    assert b"Traceback" not in completed.stderr
+    assert ("漢" in completed.stdout.decode(encoding)) == (encoding == "utf-8")

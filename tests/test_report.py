@@ -13,9 +13,11 @@ from pypdf import PdfReader
 from study.config.files import load_profile
 from study.config.grid import Grid, Rules
 from study.errors import BadInputError
+from study.figures.fonts import Fonts, fonts_for
 from study.report import __main__, build
 from study.report.build import build_report
 from study.report.markdown import markdown
+from study.report.model import read_report
 from study.report.scale import training_scale
 from study.report.summary import summarise
 from study.report.text import document
@@ -202,6 +204,24 @@ def test_a_sweep_without_any_result_still_gives_a_report(tmp_path):
     text = pdf_text(build_report(record, tmp_path))
     assert f"0 of {len(HEADS_GRID.cells())} cells" in text
     assert "No cell is finished" in text
+
+
+def test_a_title_in_any_script_is_set_in_a_font_that_has_it_or_the_missing_characters_are_named(tmp_path, capsys):
+    """DejaVu Sans has Georgian and Arabic; nobody has a character of the private planes."""
+    record = simulate(Grid(name="letters", title="ქართული العربية Ω", heads=("full",), policy_seeds=2), World(epochs=6))
+    assert "ქართული" in pdf_text(build_report(record, tmp_path))
+    assert capsys.readouterr().err == ""
+    odd = Grid(name="odd", title="script \U00016b50", heads=("full",), policy_seeds=2)
+    fonts = fonts_for(odd.title)
+    pdf = build_report(simulate(odd, World(epochs=6)), tmp_path)
+    if fonts.missing:
+        assert "U+16B50" in capsys.readouterr().err
+        assert "Characters are missing: no font on this machine has U+16B50" in pages(pdf)[0]
+        assert "U+16B50" in read_report(tmp_path / "odd").characters
+
+
+def test_words_that_need_no_other_font_get_none():
+    assert fonts_for("Größe ≤ x → é … 90 %") == Fonts()
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import io
 import os
 import shlex
 import sys
@@ -123,7 +124,13 @@ def invoke(
 
 
 def run(main: Callable[[Sequence[str]], int]) -> NoReturn:
-    """Run a command's main function; bad input is one line on stderr and exit code 2."""
+    """Run a command's main function; bad input is one line on stderr and exit code 2.
+
+    A character that the output cannot show is a substitute there.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
     try:
         code = main(sys.argv[1:])
     except BadInputError as error:

@@ -24,9 +24,10 @@ SIDES = (("o", None), ("D", "white"))  # marker and fill of the first of two swe
 GREY = "#666666"
 Drawing = Figure  # the type, for packages that do not speak to matplotlib
 WIDTH = 6.4  # [in], the report's text width
+FONT = "DejaVu Sans"  # comes with matplotlib, so every machine draws the same
 STYLE: dict[Any, Any] = {
     "font.size": 7.5,
-    "font.family": "DejaVu Sans",  # comes with matplotlib, so every machine draws the same
+    "font.family": [FONT],
     "axes.titlesize": 8,
     "axes.titlelocation": "left",
     "axes.labelsize": 7.5,

@@ -14,6 +14,7 @@ import typst
 from study.atomic import write_atomic
 from study.config.workspace import HERE
 from study.errors import BadInputError, masked
+from study.figures.fonts import fonts_for, lettering
 from study.figures.style import METADATA, save, write
 from study.report.comparison import compare
 from study.report.document import Block
@@ -36,9 +37,13 @@ def build_report(record: SweepRecord, folder: Path = HERE.reports) -> Path:
     The same record gives the same bytes. Works for a sweep with unfinished cells, and says so on its first page.
     """
     report, files = summarise(record), folder / record.grid.name
-    figures = draw(record, report)
-    report = report.model_copy(update={"figures": tuple(figures)})
-    written = [file for name, figure in figures.items() for file in save(figure, files / "figures", name)]
+    fonts = fonts_for(report.json().decode())
+    if fonts.warning:
+        print(f"warning: {fonts.warning}", file=sys.stderr)
+    with lettering(fonts):
+        figures = draw(record, report)
+        written = [file for name, figure in figures.items() for file in save(figure, files / "figures", name)]
+    report = report.model_copy(update={"figures": tuple(figures), "characters": fonts.warning})
     for file in (files / "figures").glob("*"):
         if file not in written:  # of an earlier report with other cells
             file.unlink()
@@ -48,17 +53,19 @@ def build_report(record: SweepRecord, folder: Path = HERE.reports) -> Path:
     pdf = folder / f"{record.grid.name}.pdf"
     sweep = report.sweep
     title, footer = f"{sweep.title} ({sweep.name}, {sweep.profile})", f"{sweep.name} ({sweep.profile})"
-    write_atomic(pdf, typeset(title, footer, document(report), pictures))
+    write_atomic(pdf, typeset(title, footer, document(report), pictures, fonts.files))
     return pdf
 
 
-def typeset(title: str, footer: str, blocks: Sequence[Block], pictures: dict[str, bytes]) -> bytes:
-    """Return the PDF of a document and its pictures, with the fonts that Typst brings along."""
+def typeset(
+    title: str, footer: str, blocks: Sequence[Block], pictures: dict[str, bytes], fonts: Sequence[Path] = ()
+) -> bytes:
+    """Return the PDF of a document and its pictures, with the fonts that Typst brings along, and some others."""
     listed = [{"kind": type(block).__name__, **asdict(block)} for block in blocks]
     content = json.dumps({"title": title, "footer": footer, "blocks": listed}).encode()
     files = {"main.typ": TEMPLATE.read_bytes(), "document.json": content, **pictures}
     # Its type stub does not know of files by name, which its documentation has.
-    pdf: bytes = typst.compile(files, format="pdf", ignore_system_fonts=True)  # type: ignore[call-overload]
+    pdf: bytes = typst.compile(files, format="pdf", ignore_system_fonts=True, font_paths=fonts)  # type: ignore[call-overload]
     return pdf
 
 
@@ -94,7 +101,8 @@ def side_by_side(first: str, second: str, tracking: str, figure: Path | None = N
     sides, names = (_report(first, tracking), _report(second, tracking)), (masked(first), masked(second))
     if figure:
         try:
-            write(draw_sweeps(*sides, names), figure)
+            with lettering(fonts_for("".join([*names, *(side.json().decode() for side in sides)]))):
+                write(draw_sweeps(*sides, names), figure)
         except OSError as error:
             raise BadInputError(f"cannot write {figure}: {error.strerror}; name another file") from error
     return markdown(compare(*sides, names, Path(os.path.relpath(figure)).as_posix() if figure else ""))

@@ -232,7 +232,8 @@ class Provenance(Part):
 class Report(Part):
     """Every number of a sweep's report: NaN where there is none, infinite for an epoch that is never reached.
 
-    `unread`: what of the sweep and of those that it is compared with could not be read.
+    `unread`: what of the sweep and of those that it is compared with could not be read; `characters`: what to tell
+    readers of characters that no font has.
     """
 
     format_version: int = FORMAT_VERSION
@@ -255,6 +256,7 @@ class Report(Part):
     provenance: Provenance
     figures: tuple[str, ...] = ()
     unread: tuple[str, ...] = ()
+    characters: str = ""
 
     @property
     def rules_are_younger(self) -> bool:
@@ -302,7 +304,8 @@ class Report(Part):
 
     def json(self) -> bytes:  # type: ignore[override] # pydantic's own is deprecated
         """Return the content of report.json: NaN is null, and infinity "never"."""
-        return json.dumps(_plain(self.model_dump()), indent=1, ensure_ascii=False, allow_nan=False).encode()
+        text = json.dumps(_plain(self.model_dump()), indent=1, ensure_ascii=False, allow_nan=False)
+        return text.encode(errors="replace")
 
 
 def _plain(value: Any) -> Any:
