@@ -51,6 +51,9 @@ def read_product(
 ) -> tuple[dict[str, Any], dict[str, Arrays], pd.DataFrame]:
     """Return head, parts and table of what `write_product` wrote. Raises BadInputError when a part is damaged."""
     files = (TABLE, *(f"{part}.safetensors" for part in parts))
+    missing = [name for name in (head_file, *files) if not (folder / name).is_file()]
+    if missing:
+        raise BadInputError(f"{folder} is no complete product: {', '.join(missing)} missing")
     try:
         head = json.loads((folder / head_file).read_text(encoding="utf-8"))
         for name, digest in head.get("digests", {}).items():  # the first products had no digests

@@ -9,7 +9,7 @@ import pytest
 
 from study.sweep.__main__ import main
 from study.sweep.plan import make_plan
-from study.sweep.status import SILENT, cell_statuses, seconds_left
+from study.sweep.status import SILENT, cell_statuses, heard_again, seconds_left
 from study.tracking.reader import Attempt
 from study.tracking.tracker import Tracker
 from tests.support.processes import ROOT, sweep
@@ -53,6 +53,25 @@ def test_a_running_cell_tells_where_since_when_and_how_far():
     assert (cell_state.host, cell_state.process, cell_state.device) == ("elsewhere", str(GONE), "CPU")
     assert (cell_state.stage, cell_state.epoch, cell_state.epochs) == ("encoder", 3, 12)
     assert cell_state.since == NOW - 600
+
+
+@pytest.mark.parametrize("difference", [-200.0, 200.0])
+def test_a_clock_that_differs_by_minutes_makes_no_live_machine_silent(difference):
+    def seen(at):
+        return {FIRST: [attempt("RUNNING", quiet=difference - at)]}
+
+    cells = cell_statuses(PLAN, heard_again(seen(0), seen(6), NOW), NOW)
+    assert cells[0].state == "running"
+    assert seconds_left(PLAN, cells, NOW - 1000, frames_ready=True) > 0
+    still = cell_statuses(PLAN, heard_again(seen(0), seen(0), NOW), NOW)
+    assert still[0].state == ("silent" if difference > 0 else "running")
+
+
+def test_the_options_of_the_sweep_that_is_looked_at_are_accepted(tmp_path, capsys):
+    words = ["--workers", "2", "--threads", "1", "--device", "cuda:7", "--cluster", "tls://far:8786", "--wait"]
+    uri = f"sqlite:///{tmp_path}/none.db"
+    assert main(["status", "heads", *words, "--retry-failed", "--no-report", "--tracking", uri]) == 0
+    assert "0 of" in capsys.readouterr().out
 
 
 def test_of_a_traceback_the_line_that_says_something_is_shown():

@@ -22,7 +22,7 @@ from study.config.grid import Cell, Grid
 from study.config.settings import StudySettings
 from study.errors import BadInputError, masked
 from study.results.cell_result import ARRAYS, CellResult
-from study.tracking.experiment import SQLITE, TrackerLostError, UnreadableError
+from study.tracking.experiment import SQLITE, TrackerLostError, UnreadableError, check_place
 from study.tracking.reader import Reader
 from study.tracking.tracker import Tracker
 from tests.support.servers import TrackingServer, free_port
@@ -546,6 +546,36 @@ def test_a_moved_store_is_refused_until_its_old_place_is_a_link(tmp_path, empty_
     old.mkdir()
     (old / "artifacts").symlink_to(new / "artifacts")
     assert_same_result(Tracker(uri).reader.load_result(run_id), make_result(planned["moved-0"], "moved-0"))
+
+
+@pytest.mark.parametrize(
+    ("uri", "location", "usable"),
+    [
+        ("postgresql://me:secret@db.far:5432/x", None, False),
+        ("postgresql://me:secret@db.far/x", "/nowhere/of/the/first/machine", False),
+        ("postgresql://me:secret@db.far/x", "file:///nowhere/of/the/first/machine", False),
+        ("postgresql:///x?host=db.far", None, False),
+        ("postgresql://db.far/x", "s3://bucket/folder", True),
+        ("postgresql://db.far/x", "mlflow-artifacts:/1", True),
+        ("postgresql://db.far/x", "SHARED", True),
+        ("postgresql://db.far/x", "file://SHARED", True),
+        ("postgresql://localhost/x", None, True),
+        ("postgresql://127.0.0.1:5432/x", "/nowhere", True),
+        ("postgresql:///x?host=/var/run/postgresql", None, True),
+        ("http://db.far:5000", None, True),
+        (f"{SQLITE}mlruns/mlflow.db", None, True),
+    ],
+)
+def test_a_database_of_another_host_needs_a_place_for_artifacts_that_all_machines_reach(
+    uri, location, usable, tmp_path
+):
+    location = location and location.replace("SHARED", str(tmp_path))
+    if usable:
+        check_place(uri, "study", location)
+    else:
+        with pytest.raises(BadInputError, match=r"database on db\.far.*mlflow server.*experiments create") as error:
+            check_place(uri, "study", location)
+        assert "secret" not in str(error.value)
 
 
 def test_artifacts_that_are_kept_elsewhere_on_purpose_stay_there(uri, tmp_path):

@@ -110,6 +110,20 @@ def test_each_missing_file_of_the_only_sweep_is_named(store, name):
         assert [name in line for line in record.unread] == [True]
 
 
+def test_all_that_is_missing_is_listed_at_once(store, tmp_path):
+    tracker, _, run = store
+    for name in PLAN_FILES:
+        (artifacts(tracker, run) / name).unlink()
+    with pytest.raises(UnreadableError, match=rf"{', '.join(PLAN_FILES)} of run {run}"):
+        tracker.reader.read_sweep("pair")
+    result = simulate(PAIR, World(epochs=6)).results.popitem()[1]
+    folder = result.save(tmp_path / "result")
+    for name in ("curves.parquet", "encoder.safetensors"):
+        (folder / name).unlink()
+    with pytest.raises(BadInputError, match=r"curves\.parquet, encoder\.safetensors missing"):
+        result.load(folder)
+
+
 def test_a_cell_whose_result_is_gone_is_named_and_the_others_are_reported(store):
     tracker, _, _ = store
     key, gone = next(iter(tracker.reader.read_sweep("pair").planned.items()))

@@ -59,6 +59,7 @@ def sweep(
 @options.plan_options()
 @tracking_option()
 @click.option("--json", "as_json", is_flag=True, help="one JSON object on stdout")
+@options.accept_run_options()
 def status(*, plan: Plan, tracking: str, as_json: bool) -> int:
     """Show what of the sweep NAME is finished, what runs where, and what is left. Give the settings of the sweep."""
     return int(resolve_name("study.sweep.status:show_status")(plan, tracking, as_json=as_json))

@@ -113,6 +113,19 @@ def run_options() -> Decorator:
     )
 
 
+def accept_run_options() -> Decorator:
+    """Accept what a sweep was started with, which looking at it does not need."""
+
+    def decorate(command: Any) -> Any:
+        for name in ("--workers", "--cluster", "--certificates", "--device", "--threads"):
+            click.option(name, hidden=True, expose_value=False)(command)
+        for name in ("--wait", "--retry-failed", "--no-report"):
+            click.option(name, is_flag=True, hidden=True, expose_value=False)(command)
+        return command
+
+    return decorate
+
+
 def check_installed() -> None:
     """Raise BadInputError when the machine lacks what training needs, before hours are spent on the data."""
     for name in ("torch", "lightning", "pandas", "pyarrow", "cv2", "safetensors", "filelock"):

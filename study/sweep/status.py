@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import platform
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -33,6 +34,8 @@ STATES: dict[State, str] = {  # with its style on a terminal
     "waiting": "dim",
     "failed": "red",
 }
+Attempts = Mapping[str, Sequence["Attempt"]]
+AGAIN = 12.0  # [s] between two looks at a machine that seems silent: more than two signs of life take
 SILENT = 120.0  # [s] without a sign of life: several times what loading torch or a commit takes on a busy machine
 
 
@@ -61,7 +64,7 @@ class CellStatus:
     reason: str = ""
 
 
-def cell_statuses(plan: Plan, attempts: Mapping[str, Sequence[Attempt]], now: float) -> list[CellStatus]:
+def cell_statuses(plan: Plan, attempts: Attempts, now: float) -> list[CellStatus]:
     """Return where each cell of a plan stands at a time [s since 1970]."""
     return [_cell_status(plan, key, attempts.get(key, ()), now) for key in plan.cells]
 
@@ -99,6 +102,22 @@ def _cell_status(plan: Plan, key: str, attempts: Sequence[Attempt], now: float) 
     )
 
 
+def heard_again(before: Attempts, after: Attempts, now: float) -> Attempts:
+    """Return later attempts; one that has given a sign of life since the earlier look has given it now.
+
+    The clock of its machine may differ from this one's by minutes.
+    """
+    signs = {attempt.run_id: attempt.tags.get("alive") for each in before.values() for attempt in each}
+
+    def corrected(attempt: Attempt) -> Attempt:
+        sign = attempt.tags.get("alive")
+        if sign == signs.get(attempt.run_id, sign):
+            return attempt
+        return dataclasses.replace(attempt, tags={**attempt.tags, "alive": str(round(now * 1000))})
+
+    return {key: [corrected(attempt) for attempt in each] for key, each in after.items()}
+
+
 def _first(reason: str) -> str:
     """Return the line of a reason that says most: of a traceback the last."""
     lines = reason.strip().splitlines() or ["unknown"]
@@ -117,7 +136,7 @@ def seconds_left(plan: Plan, cells: Sequence[CellStatus], now: float, *, frames_
             expected, measured = expected + costs[cell.key], measured + cell.took
         if cell.state == "running" and cell.since is not None and cell.share > 0:
             begun = RESULT_S + (costs[cell.key] - RESULT_S) * cell.share
-            expected, measured = expected + begun, measured + now - cell.since
+            expected, measured = expected + begun, measured + max(0.0, now - cell.since)
         if cell.state not in ("finished", "failed"):
             left += costs[cell.key] * (1 - (cell.share if cell.state == "running" else 0.0))
     at_a_time = max(1, sum(cell.state == "running" for cell in cells))
@@ -129,7 +148,13 @@ def show_status(plan: Plan, tracking: str, *, as_json: bool) -> int:
     """Print where the cells of a plan stand, and return exit code 0."""
     reader = look_up(tracking)
     now = time.time()
-    cells = cell_statuses(plan, reader.attempts(plan.cells) if reader else {}, now)
+    attempts = reader.attempts(plan.cells) if reader else {}
+    cells = cell_statuses(plan, attempts, now)
+    if reader and any(cell.state == "silent" and cell.host != platform.node() for cell in cells):
+        time.sleep(AGAIN)
+        now = time.time()
+        attempts = heard_again(attempts, reader.attempts(plan.cells), now)
+        cells = cell_statuses(plan, attempts, now)
     left = seconds_left(plan, cells, now, frames_ready=plan.frames_ready)
     if as_json:
         facts = {
@@ -169,7 +194,9 @@ def _row(cell: CellStatus, now: float) -> tuple[str, str, str, str, str]:
         how += f", epoch {cell.epoch} of {cell.epochs}" if cell.epochs else ""
         if cell.state != "running":
             how += f"; no sign of life for {duration_text(cell.quiet)}"
-        since = f"since {time.strftime('%H:%M', time.localtime(cell.since))} ({duration_text(now - cell.since)})"
+        since = (
+            f"since {time.strftime('%H:%M', time.localtime(cell.since))} ({duration_text(max(0.0, now - cell.since))})"
+        )
         where = f"{cell.host}, process {cell.process}" if cell.host else ""
         where += f", {cell.device}" if cell.device else ""
     elif cell.attempt:

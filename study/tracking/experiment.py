@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import logging
 import os
+import platform
 import re
 import shutil
 import sqlite3
 import tempfile
 import urllib.error
+import urllib.parse
 import urllib.request
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -116,8 +118,10 @@ def open_experiment(uri: str, name: str) -> Experiment:
     client, shown, artifacts = _connect(uri)
     with guard(shown, opening=True), few_tries(BUSY):
         if client.get_experiment_by_name(name) is None:
+            check_place(uri, name, None)
             client.create_experiment(name, str(artifacts) if artifacts else None, {BESIDE: "true"})
         entity = client.get_experiment_by_name(name)
+        check_place(uri, name, entity.artifact_location)
         experiment = _usable(entity, client, shown, artifacts)
         for key, value in experiment_tags(experiment.id, entity.tags).items():
             if entity.tags.get(key) != value:
@@ -220,6 +224,44 @@ def _usable(entity: MlflowExperiment, client: MlflowClient, shown: str, artifact
             f"was, or, if it was moved, link the old path to the new one: ln -s {artifacts} {place}"
         )
     return Experiment(client, shown, str(entity.experiment_id))
+
+
+def check_place(uri: str, name: str, location: str | None) -> None:
+    """Raise BadInputError when artifacts would lie where other users of a database on another host cannot read them.
+
+    `location`: where the experiment of that name has its artifacts; None: it is to be made.
+    """
+    host = None if uri.startswith((SQLITE, "http")) else _other_host(uri)
+    if host is None or (location and (_is_remote(location) or _folder(location).is_dir())):
+        return
+    shown = masked(uri)
+    place = (
+        f"its artifacts in {location}, a folder that this machine lacks" if location else "no place for artifacts yet"
+    )
+    raise BadInputError(
+        f"{shown} is a database on {host}, and experiment '{name}' has {place}: results are files, which every machine "
+        f"must reach. Start a server on {host}: mlflow server --host {host} --backend-store-uri {shown} "
+        f"--artifacts-destination FOLDER, and give --tracking http://{host}:5000; or make the experiment with a place "
+        f"that all machines reach: MLFLOW_TRACKING_URI={shown} mlflow experiments create --experiment-name NAME "
+        f"--artifact-location s3://BUCKET/FOLDER (or a shared folder, which exists)"
+    )
+
+
+def _is_remote(location: str) -> bool:
+    scheme = urllib.parse.urlsplit(location).scheme
+    return scheme not in {"", "file"}
+
+
+def _folder(location: str) -> Path:
+    return Path(urllib.request.url2pathname(location.removeprefix("file://")))
+
+
+def _other_host(uri: str) -> str | None:
+    """Return the host of a database's URI, or None for this machine."""
+    parts = urllib.parse.urlsplit(uri)
+    host = parts.hostname or urllib.parse.parse_qs(parts.query).get("host", [""])[0]
+    here = host in {"", "localhost", "::1", platform.node()} or host.startswith(("127.", "/"))
+    return None if here else host
 
 
 def _probe(uri: str, shown: str) -> None:

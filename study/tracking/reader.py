@@ -6,7 +6,7 @@ A cell is done when its run is FINISHED with its `cell_key`, whichever sweep has
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -22,6 +22,7 @@ from study.tracking.experiment import Experiment, TrackerLostError, UnreadableEr
 
 PLAN_VERSION = 1
 RESULT = "result"  # artifact folder of a cell run
+SWEEP_FILES = ("plan.json", "data.json", "provenance.json", "uncommitted.diff")  # artifacts of a sweep run
 PERMANENT = "permanent"  # tag of a failed attempt: another try would not help
 
 
@@ -145,13 +146,17 @@ class Reader:
 
     def read_sweep_run(self, run_id: str) -> SweepRecord:
         """Return a sweep with its finished cells. Raises UnreadableError when its plan or its data cannot be read."""
+        missing = self._missing(run_id)
+        if missing and {"plan.json", "data.json"} & set(missing):
+            raise UnreadableError(self._lacks(run_id, missing))
         grid, profile, settings, planned = self._read_plan(run_id)
         data = self.experiment.read_json(run_id, "data.json")
-        unread: list[str] = []
+        unread = [self._lacks(run_id, missing)] if missing else []
         provenance: dict[str, Any] = {}
         try:
-            provenance = self.experiment.read_json(run_id, "provenance.json")
-            provenance["diff"] = self.experiment.read_text(run_id, "uncommitted.diff")
+            if not missing:
+                provenance = self.experiment.read_json(run_id, "provenance.json")
+                provenance["diff"] = self.experiment.read_text(run_id, "uncommitted.diff")
         except UnreadableError as error:
             unread.append(str(error))
         with self.experiment.guard():
@@ -169,6 +174,15 @@ class Reader:
         return SweepRecord(
             grid, profile, settings, planned, results, failed, provenance, data, run_id=run_id, unread=tuple(unread)
         )
+
+    def _missing(self, run_id: str) -> list[str]:
+        """Return the files that a sweep's run lacks, all of them."""
+        with self.experiment.guard():
+            there = {file.path for file in self.experiment.client.list_artifacts(run_id)}
+        return [name for name in SWEEP_FILES if name not in there]
+
+    def _lacks(self, run_id: str, missing: Sequence[str]) -> str:
+        return f"{', '.join(missing)} of run {run_id} in {self.experiment.uri} cannot be read: no such artifact"
 
     def _read_plan(self, run_id: str) -> tuple[Grid, str, StudySettings, dict[str, Cell]]:
         plan = self.experiment.read_json(run_id, "plan.json")
