@@ -3,6 +3,7 @@
 import json
 import math
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -13,10 +14,13 @@ from study.config.files import load_profile
 from study.data.__main__ import main
 from study.data.birdview import valid_moments
 from study.episode.files import read_episode, write_episode
+from study.episode.findings import Findings
 from study.episode.importing import check_drives, import_drives
+from study.episode.motion import motion_faults
+from study.episode.rows import episode_rows
 from study.errors import BadInputError
 from study.sim.record import record_episode
-from tests.support.drives import write_drives
+from tests.support.drives import crossing_drive, write_drives
 from tests.support.spoil import spoil
 
 HEAD, CHART, STATES, LIGHTS, ROUTES = "episode.json", "map.json", "states.parquet", "lights.parquet", "routes.parquet"
@@ -85,6 +89,19 @@ def test_drives_of_our_own_have_no_findings(tmp_path):
         town = record_episode(settings.town, settings.dynamics, settings.recording, seed)
         write_episode(town, tmp_path / "log" / f"town-{seed}")
     assert list(check_drives(tmp_path / "log")) == []
+
+
+def test_measured_drives_are_noisy_and_pass():
+    """Positions to 0.2 m, speeds to 0.4 m/s, headings to 0.04 rad, independent at each step."""
+    noise = np.random.default_rng(0)
+    for seed in range(3):
+        drive = crossing_drive(seed)
+        rows = episode_rows(drive)
+        for name, spread in {"x": 0.2, "y": 0.2, "speed": 0.4, "heading": 0.04}.items():
+            rows[name] = (rows[name] + noise.normal(0, spread, len(rows[name]))).astype(np.float32)
+        findings = Findings(Path("drive"))
+        assert not motion_faults(rows, 10.0, drive.agents, findings).any()
+        assert findings.errors == []
 
 
 # --- points -----------------------------------------------------------------------------------------------------------

@@ -44,9 +44,10 @@ class Findings:
         """Add a fault of one of the files; `text` follows the file's name."""
         self.errors.append(Finding(f"{self.folder / file}{text}", count, unit))
 
-    def refused(self, error: BadInputError) -> None:
+    def refused(self, error: BadInputError | OSError) -> None:
         """Add an error that names its file itself."""
-        self.errors.append(Finding(str(error)))
+        text = f"cannot read {error.filename}: {error.strerror}" if isinstance(error, OSError) else str(error)
+        self.errors.append(Finding(text))
 
     def warn(self, file: str, text: str) -> None:
         """Add a warning about one of the files; `text` follows the file's name."""

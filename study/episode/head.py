@@ -17,7 +17,7 @@ def read_json(path: Path) -> dict[str, Any]:
         content = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise BadInputError(f"cannot read {path}: {error.strerror}; is {path.parent} an Episode?") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise BadInputError(f"{path} is not valid JSON ({error}): truncated or foreign") from error
     if not isinstance(content, dict):
         raise BadInputError(f"{path} holds {type(content).__name__}, not a JSON object")

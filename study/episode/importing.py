@@ -50,23 +50,31 @@ def import_drives(
         raise BadInputError(f"--out {out} lies within {source}; it would be imported the next time")
     try:
         with atomic_folder(out) as draft:
-            drives: list[Drive] = []
-            for name, recording, findings in _examine_all(source):
-                if not drop_bad:
-                    findings.refuse(ADVICE)
-                for finding in findings.warnings:
-                    tell(f"warning: {finding}")
-                if findings.errors:
-                    tell(_left_out(findings, recording))
-                if recording:
-                    drives.extend(_import_recording(name, recording, findings, draft))
-            if not drives:
-                raise BadInputError(f"{source}: nothing is left of its Episodes; --check lists what is wrong with them")
+            drives = _import_all(source, draft, drop_bad, tell)
             content = {"schema_version": SCHEMA_VERSION, "drives": [asdict(drive) for drive in drives]}
             (draft / "import.json").write_text(json.dumps(content, indent=1, allow_nan=False))
     except OSError as error:
         raise BadInputError(f"cannot write {out}: {error.strerror}; name another folder with --out") from error
     return Imported(out, tuple(drives))
+
+
+def _import_all(source: Path, draft: Path, drop_bad: bool, tell: Callable[[str], None]) -> list[Drive]:  # noqa: FBT001
+    drives: list[Drive] = []
+    warnings: dict[str, list[Finding]] = {}
+    for name, recording, findings in _examine_all(source):
+        if not drop_bad:
+            findings.refuse(ADVICE)
+        for finding in findings.warnings:
+            warnings.setdefault(str(finding).removeprefix(str(findings.folder)), []).append(finding)
+        if findings.errors:
+            tell(_left_out(findings, recording))
+        if recording:
+            drives.extend(_import_recording(name, recording, findings, draft))
+    for alike in warnings.values():
+        tell(f"warning: {alike[0]}" + (f" [{len(alike)} drives]" if len(alike) > 1 else ""))
+    if not drives:
+        raise BadInputError(f"{source}: nothing is left of its Episodes; --check lists what is wrong with them")
+    return drives
 
 
 def _examine_all(source: Path) -> Iterator[tuple[str, Recording | None, Findings]]:

@@ -24,6 +24,7 @@ FILES = ("map.json", "states.parquet", "lights.parquet", "routes.parquet")
 LIGHTS = pa.schema([("step", pa.int32()), ("light", pa.int32()), ("state", pa.int8())])
 ROUTES = pa.schema([("agent", pa.int32()), ("x", pa.float32()), ("y", pa.float32())])
 MOST_CELLS = 1 << 20  # steps x agents of a part: dense, it takes 43 MB
+MOST_STEPS = 10_000_000  # eleven days at 10 Hz
 SHORTEST = 600  # steps that are not cut any more
 
 Floats = NDArray[np.float32]
@@ -103,7 +104,7 @@ def read_recording(folder: Path, findings: Findings) -> Recording | None:
         rate, steps, labels, agents = _parse_head(path, head, findings)
         name, source = typed_field(head, "id", str, path), typed_field(head, "source", dict, path)
         lanes, lights = _parse_map(folder / "map.json", findings)
-    except BadInputError as error:
+    except (BadInputError, OSError) as error:
         findings.refused(error)
         return None
     source = _parse_source(source, findings)
@@ -115,7 +116,7 @@ def read_recording(folder: Path, findings: Findings) -> Recording | None:
     ):
         try:
             tables.append(read())
-        except BadInputError as error:
+        except (BadInputError, OSError) as error:
             findings.refused(error)
     if len(tables) < 3:
         return None
@@ -149,12 +150,14 @@ def _parse_map(path: Path, findings: Findings) -> tuple[tuple[Lane, ...], tuple[
 
 def _parse_head(path: Path, head: dict[str, Any], findings: Findings) -> tuple[float, int, str, tuple[Agent, ...]]:
     try:
-        rate = fields.number(head, "rate_hz", "", 0)
+        rate = fields.number(head, "rate_hz", "", 0, 10_000)
         steps = fields.integer(head, "steps", "")
         labels = typed_field(head, "labels", str, path)
         agents = parse_objects(head, "agents", _agent, path.name, findings)
-        if steps < 0 or labels not in LABELS:
-            raise BadInputError(f"{path}: steps is {steps}, labels is '{labels}'; choose from {', '.join(LABELS)}")
+        if labels not in LABELS:
+            raise BadInputError(f"{path}: field 'labels' is '{labels}'; choose from {', '.join(LABELS)}")
+        if not 0 <= steps <= MOST_STEPS:
+            raise BadInputError(f"{path}: field 'steps' is {steps}; 0 to {MOST_STEPS:,} are needed")
     except fields.BadFieldError as error:
         raise BadInputError(f"{path}: {error}") from error
     return rate, steps, labels, tuple(agents)

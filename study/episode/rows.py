@@ -50,6 +50,8 @@ def read_columns(path: Path, schema: pa.Schema, required: set[str]) -> tuple[Row
     for field in schema:
         if field.name not in table.column_names:
             continue
+        if table.column_names.count(field.name) > 1:
+            raise BadInputError(f"{path}, field '{field.name}' stands twice in the table; keep one of the columns")
         column = table.column(field.name)
         number = pa.types.is_integer(column.type) or pa.types.is_floating(column.type) or pa.types.is_null(column.type)
         try:
