@@ -34,8 +34,12 @@ EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
 EXIT_AGAIN = 75  # of study.sweep train: cells are left, the same command continues
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 # A disk that is full, a folder that cannot be: the user can change that, anything else is a fault.
-WRITE_ERRORS = (*FULL, errno.EACCES, errno.EROFS, errno.ENOTDIR, errno.EEXIST)
+WRITE_ERRORS = (
+    *(*FULL, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST),
+    *(errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG),
+)
 WRITERS = (  # what libraries say of a full disk in errors of their own, in small letters
+    "no usable temporary directory",  # of Python, where TMPDIR and /tmp cannot be written
     *("no space left on device", "disk quota exceeded", "disk is full"),
     *("pytorchstreamwriter", "inline_container.cc", "iostream error", "file write failed"),  # torch's archives
 )
@@ -47,7 +51,7 @@ def write_failure(error: BaseException) -> str | None:
     if isinstance(error, OSError) and error.errno in WRITE_ERRORS:
         return f"cannot write {error.filename or 'a file'}: {error.strerror}; {GO_ON}"
     if not isinstance(error, BadInputError) and any(words in str(error).lower() for words in WRITERS):
-        return f"cannot write a file, probably since the disk is full: {str(error).splitlines()[0]}; {GO_ON}"
+        return f"cannot write a file: {str(error).splitlines()[0]}; {GO_ON}"
     behind = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
     if behind is None or (isinstance(behind, OSError) and behind.errno not in FULL):
         return None

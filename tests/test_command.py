@@ -11,6 +11,7 @@ import pytest
 
 from study.config.baselines import BASELINES
 from study.console.interrupts import STOP_SECONDS, check_stopped, stoppable
+from study.console.options import run
 from study.errors import EXIT_AGAIN, EXIT_BAD_INPUT, EXIT_INTERRUPTED
 from tests.support.processes import sweep
 from tests.support.sweeps import working_folder
@@ -44,7 +45,7 @@ def folder(tmp_path_factory):
         (["heads", "--cluster", "somewhere"], "tls://host:8786"),
         (["heads", "--cluster", "tcp://127.0.0.1:1", "--workers", "2"], "leave one of them out"),
         (["heads", "--dry-run", "--tracking=postgresql://me:secret@host/db"], "postgresql://***@host/db"),
-        (["status", "heads", "--retry-failed"], "No such option '--retry-failed'"),
+        (["verify", "heads", "--retry-failed"], "No such option '--retry-failed'"),
         ([], "NAME"),
     ],
 )
@@ -151,3 +152,52 @@ def test_what_the_output_cannot_show_is_a_substitute(encoding):
     assert completed.stderr.startswith(b"error: no file ")
     assert b"Traceback" not in completed.stderr
     assert ("漢" in completed.stdout.decode(encoding)) == (encoding == "utf-8")
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        PermissionError(13, "Permission denied", "/cache"),
+        OSError(30, "Read-only file system", "reports"),
+        OSError(36, "File name too long", "x" * 20),
+        NotADirectoryError(20, "Not a directory", "data/tmp"),
+        FileNotFoundError(2, "No usable temporary directory found in ['/tmp']"),
+    ],
+    ids=lambda error: error.strerror,
+)
+def test_a_folder_that_cannot_be_written_is_one_clear_error(error, capsys):
+    def main(words):
+        raise error
+
+    with pytest.raises(SystemExit) as end:
+        run(main)
+    assert end.value.code == EXIT_BAD_INPUT
+    assert "error: cannot write" in (message := capsys.readouterr().err)
+    assert "give the same command again" in message
+
+
+def test_a_fault_of_this_program_keeps_its_traceback():
+    def main(words):
+        raise FileNotFoundError(2, "No such file or directory", "x")
+
+    with pytest.raises(FileNotFoundError):
+        run(main)
+
+
+def test_a_home_that_cannot_be_written_and_a_cache_that_is_swept_cost_nothing(tmp_path):
+    (tmp_path / "home").touch()
+    code = (
+        "import shutil; from study.console.options import run\n"
+        "def main(words):\n"
+        "    import matplotlib; from study.figures.fonts import fonts_for\n"
+        "    shutil.rmtree(matplotlib.get_configdir()); print(len(fonts_for('Ω').files)); return 0\n"
+        "run(main)"
+    )
+    environment = {name: value for name, value in os.environ.items() if not name.startswith(("XDG_", "MPL"))}
+    environment |= {"HOME": str(tmp_path / "home"), "TMPDIR": str(tmp_path)}
+    completed = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, env=environment
+    )
+    assert (completed.returncode, completed.stdout) == (0, "1\n"), completed.stderr
+    assert "Traceback" not in completed.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["home"]

@@ -578,6 +578,26 @@ def test_a_database_of_another_host_needs_a_place_for_artifacts_that_all_machine
         assert "secret" not in str(error.value)
 
 
+@pytest.mark.parametrize("name", ["a?b", "50%25"])
+def test_a_folder_whose_name_mlflow_would_misread_is_refused_and_nothing_is_made(name, tmp_path, monkeypatch):
+    (tmp_path / name).mkdir()
+    monkeypatch.chdir(tmp_path / name)
+    with pytest.raises(BadInputError, match="work in a folder without"):
+        Tracker(f"{SQLITE}mlruns/mlflow.db")
+    assert [path.name for path in tmp_path.rglob("*")] == [name]
+
+
+@pytest.mark.parametrize("name", ["with blank", "hash #1", "ünïcödé 漢字", "quote's", "plus+and&"])
+def test_a_folder_of_any_other_name_holds_results(name, tmp_path, empty_store):
+    (tmp_path / name).mkdir()
+    shutil.copy(empty_store, tmp_path / name)
+    tracker = Tracker(f"{SQLITE}{tmp_path / name}/mlflow.db")
+    planned = cells("odd")
+    run = train(tracker, open_sweep(tracker, planned), planned, "odd-0")
+    assert tracker.reader.load_result(run).key == "odd-0"
+    assert {path.name for path in tmp_path.iterdir()} == {name}
+
+
 def test_artifacts_that_are_kept_elsewhere_on_purpose_stay_there(uri, tmp_path):
     Tracker(uri).client.create_experiment("elsewhere", str(tmp_path / "artifacts"))
     planned = cells("elsewhere")

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import atexit
 import functools
 import io
 import os
 import shlex
+import shutil
 import sys
+import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NoReturn
 
@@ -123,6 +128,21 @@ def invoke(
         raise BadInputError(f"{error.format_message().rstrip('.')}; see {path} --help") from None
 
 
+def _spare_cache() -> None:
+    """Name a folder for matplotlib where the home cannot be written.
+
+    Its own spare one, once swept, ends in a traceback. Processes that this one starts have the same.
+    """
+    usual = Path(os.environ.get("XDG_CONFIG_HOME") or os.path.expanduser("~/.config"), "matplotlib")  # noqa: PTH111
+    there = next(path for path in (usual, *usual.absolute().parents) if os.path.exists(path))  # noqa: PTH110
+    if "MPLCONFIGDIR" in os.environ or (there.is_dir() and os.access(there, os.W_OK)):
+        return
+    with suppress(OSError):  # then whoever needs the folder says so
+        folder = tempfile.mkdtemp(prefix="study-")
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        os.environ["MPLCONFIGDIR"] = folder
+
+
 def run(main: Callable[[Sequence[str]], int]) -> NoReturn:
     """Run a command's main function; bad input is one line on stderr and exit code 2.
 
@@ -131,6 +151,7 @@ def run(main: Callable[[Sequence[str]], int]) -> NoReturn:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
+    _spare_cache()
     try:
         code = main(sys.argv[1:])
     except BadInputError as error:

@@ -148,7 +148,7 @@ def show_status(plan: Plan, tracking: str, *, as_json: bool) -> int:
     """Print where the cells of a plan stand, and return exit code 0."""
     reader = look_up(tracking)
     now = time.time()
-    attempts = reader.attempts(plan.cells) if reader else {}
+    attempts: Attempts = reader.attempts(plan.cells) if reader else {}
     cells = cell_statuses(plan, attempts, now)
     if reader and any(cell.state == "silent" and cell.host != platform.node() for cell in cells):
         time.sleep(AGAIN)

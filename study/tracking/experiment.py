@@ -198,6 +198,11 @@ def _connect(uri: str) -> tuple[MlflowClient, str, Path | None]:
         raise BadInputError(f"tracking URI '{shown}' cannot be used; give {HERE.tracking} or http://host:port")
     database, artifacts = database_file(uri), None
     if database:
+        if odd := {"?", "%"} & set(str(database)):
+            raise BadInputError(
+                f"{database} cannot be a tracking store: MLflow reads {' and '.join(sorted(odd))} in a folder's name "
+                "as something else; work in a folder without, or name one with --tracking"
+            )
         _prepare_database(database, shown)
         uri, artifacts = f"{SQLITE}{database}", database.parent / "artifacts"
     elif uri.startswith("http"):
