@@ -10,6 +10,7 @@ picture and paints the moving things into it.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -110,21 +111,30 @@ class Renderer:
         check_rate(episode)
         names = [head.target for head in mask_heads().values()] if targets is None else targets
         self._targets = [find_target(name) for name in names]
-        self.episode = episode
         self.settings = settings
         self._palette = _palette(settings.history)
         scale = settings.render / settings.view
         self._window = _Window(scale, settings.render / 2, (settings.view - settings.behind) * scale)
-        self._sizes = np.array([(agent.length, agent.width) for agent in episode.agents]).reshape(-1, 2)
         self._map = _Map(episode.lanes, scale, settings.render)
+        self._take(episode)
+        corner = np.hypot(settings.view / 2, max(settings.behind, settings.view - settings.behind))
+        self._route_ahead = np.arange(0, 1.5 * corner, ROUTE_POINTS)
+
+    def on(self, episode: Episode) -> Renderer:
+        """Return the renderer of another Episode on the same map, which is not painted again."""
+        other = copy.copy(self)
+        other._take(episode)  # noqa: SLF001 - its own kind
+        return other
+
+    def _take(self, episode: Episode) -> None:
+        self.episode = episode
+        self._sizes = np.array([(agent.length, agent.width) for agent in episode.agents]).reshape(-1, 2)
         self._routes = [
             (np.concatenate([[0.0], np.hypot(*np.diff(route, axis=0).T).cumsum()]), *route.T.astype(np.float64))
             if len(route) > 1
             else None
             for route in episode.routes
         ]
-        corner = np.hypot(settings.view / 2, max(settings.behind, settings.view - settings.behind))
-        self._route_ahead = np.arange(0, 1.5 * corner, ROUTE_POINTS)
 
     def render(self, moments: NDArray[np.integer[Any]]) -> tuple[Image, Image]:
         """Paint moments [M, 2] of (step, agent index): images [M, 64, 64, 3] uint8 RGB, masks [M, K, 512] uint8.
@@ -185,7 +195,7 @@ class Renderer:
                         cv2.fillConvexPoly(flat, polygon, _MASK, cv2.LINE_8, FRACTION_BITS)
                     grey[index, mask] = _shrink(flat)
             start = plan
-        masks[:] = np.packbits((grey >= _MASK // 2).reshape(*masks.shape[:2], -1), axis=2)
+        masks[:] = np.packbits((grey >= _MASK // 2).reshape(*masks.shape[:2], IMAGE * IMAGE), axis=2)
 
     def _boxes(
         self, moments: Moments, affines: Floats, heading: Floats
@@ -196,7 +206,7 @@ class Renderer:
         """
         episode, history, size = self.episode, self.settings.history, self.settings.render
         scale = self._window.scale
-        offsets = np.arange(-history, self.settings.future + 1)
+        offsets = np.arange(-history, self.settings.future + 1 if self._targets else 1)  # an image shows no future
         steps = moments[:, :1] + offsets
         inside = (steps >= 0) & (steps < episode.steps)
         steps = steps.clip(0, episode.steps - 1)

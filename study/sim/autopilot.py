@@ -16,7 +16,7 @@ from study.config.paper import ACCELERATIONS
 from study.config.settings import DynamicsSettings
 from study.episode.schema import GREEN, RED, YELLOW
 from study.sim.dynamics import BRAKE, DT, LOOK, stopping_distance
-from study.sim.geometry import LENGTH, WIDTH, Floats, Ints, Pose
+from study.sim.geometry import LENGTH, WIDTH, Floats, Ints, Pose, true_pairs
 from study.sim.town import Town
 
 REACH = LOOK + 8.0  # distance between centres within which lie all vehicles of the look-ahead [m]
@@ -121,12 +121,7 @@ class Fleet:
         """Extend a route that gets short, and sample the path as far as the look-ahead needs."""
         signalled = bool(self.town.signals)
         while self.ends[slot] < self.s[slot] + AHEAD + 60 or (signalled and len(self.turns[slot]) < 2):
-            number = self._choose(self.town.ways[self.routes[slot][-1]])
-            movement = self.town.movements[number]
-            if self.town.phases[movement.node]:
-                self.turns[slot].append((number, float(self.ends[slot])))
-            for strip in (*movement.strips, movement.exit):
-                self._append(slot, strip)
+            self._turn(slot, self.rng)
         spare = int(self.s[slot] / SPACING) - int(BEHIND / SPACING) - int(self.first[slot])
         if 0 < spare < self.filled[slot]:
             kept = int(self.filled[slot]) - spare
@@ -138,11 +133,24 @@ class Fleet:
             self._sample(slot, int(self.sampled[slot]))
             self.sampled[slot] += 1
 
-    def _choose(self, ways: tuple[int, ...]) -> int:
+    def plan(self, slot: int, distance: float, rng: np.random.Generator) -> None:
+        """Extend a vehicle's route to `distance` [m] ahead, drawn from `rng`: it no longer depends on the traffic."""
+        while self.ends[slot] < self.s[slot] + distance:
+            self._turn(slot, rng)
+
+    def _turn(self, slot: int, rng: np.random.Generator) -> None:
+        number = self._choose(self.town.ways[self.routes[slot][-1]], rng)
+        movement = self.town.movements[number]
+        if self.town.phases[movement.node]:
+            self.turns[slot].append((number, float(self.ends[slot])))
+        for strip in (*movement.strips, movement.exit):
+            self._append(slot, strip)
+
+    def _choose(self, ways: tuple[int, ...], rng: np.random.Generator) -> int:
         """Return a random movement; full streets are avoided, since rings of them would lock for ever."""
         exits = self.move_exit[list(ways)]
         free = np.maximum(1 - self.load[exits] * GAP / self.street_length[exits], 0.02) ** 2
-        return ways[int(np.searchsorted(np.cumsum(free), self.rng.random() * free.sum()))]
+        return ways[int(np.searchsorted(np.cumsum(free), rng.random() * free.sum()))]
 
     def _sample(self, slot: int, number: int) -> None:
         start, filled = self.starts[slot][number], int(self.filled[slot])
@@ -329,7 +337,7 @@ class Fleet:
         waits = (self.move >= 0) & (front > -45)
         one, other = np.flatnonzero(waits), np.flatnonzero(waits & goes)
         table = town.enter[self.move[one][:, None], self.move[other][None]]
-        rows, columns = np.nonzero(~np.isnan(table))
+        rows, columns = true_pairs(~np.isnan(table))
         i, j = one[rows], other[columns]
         a, b = self.move[i], self.move[j]
         into_i, out_i, into_j, out_j = town.enter[a, b], town.leave[a, b], town.enter[b, a], town.leave[b, a]

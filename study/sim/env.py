@@ -18,7 +18,7 @@ from study.errors import BadInputError
 from study.randomness import rng
 from study.sim.autopilot import MOST_STEERING, REACH, Decisions, Fleet
 from study.sim.dynamics import BRAKE, DT, LOOK, THROTTLE, TOP_SPEED, check_dynamics, follow_command
-from study.sim.geometry import LENGTH
+from study.sim.geometry import LENGTH, Pose
 from study.sim.lights import LightPlan, plan_lights
 from study.sim.road import TownNetwork, TownRoad, TownVehicle
 from study.sim.town import Town, draw_town
@@ -54,8 +54,10 @@ class Traffic(TownRoad):
         self.agents: list[int] = []  # of each vehicle; a vehicle that replaces another has a new number
         self.commands: dict[int, tuple[float, float]] = {}  # vehicle -> (acceleration, steering) for this step
         self.crashed: list[int] = []  # vehicles that collided in the last step, by now replaced
+        self.crash_pose: Pose  # of all vehicles after that step, before these were replaced
         self.collided = 0  # vehicles since the start
-        self.decisions: Decisions
+        self.decisions: Decisions  # of the step that `decided` numbers
+        self.decided = -1
         streets = [k for k, strip in enumerate(town.strips) if k in town.ways and strip.piece.length > 2 * APART]
         self.streets = np.array(streets or sorted(town.ways), np.int64)
         pieces = [strip.piece for strip in town.strips]
@@ -96,17 +98,23 @@ class Traffic(TownRoad):
         x, y, _, _ = self.pose()
         self.fleet.follow(x, y)
 
+    def decide(self) -> Decisions:
+        """Return the autopilot's commands for this step, decided once; `act` may replace some."""
+        if self.decided < self.steps:
+            pose = self.pose()
+            self.light_states = self.lights.states(self.time)
+            self.decisions = self.fleet.decide(
+                self.steps, pose, (self.force, self.wheel), self.pairs_within(REACH, pose), self.light_states
+            )
+            self.decided = self.steps
+        return self.decisions
+
     def act(self) -> None:
-        """Decide the command of every vehicle; one in `commands` takes it from there."""
-        pose = self.pose()
-        self.light_states = self.lights.states(self.time)
-        decisions = self.fleet.decide(
-            self.steps, pose, (self.force, self.wheel), self.pairs_within(REACH, pose), self.light_states
-        )
+        """Have every vehicle do what is decided; one in `commands` takes its command from there."""
+        decisions = self.decide()
         for slot, (acceleration, steering) in self.commands.items():
             decisions.acceleration[slot], decisions.steering[slot] = acceleration, steering
-        self.decisions = decisions
-        speed = pose[3]
+        speed = np.array([vehicle.speed for vehicle in self.vehicles])
         push = np.where(decisions.acceleration == ACCELERATIONS[1], THROTTLE[0.5], THROTTLE[1.0])
         force = np.where(decisions.acceleration == ACCELERATIONS[0], -BRAKE, push * (1 - speed / TOP_SPEED))
         force = follow_command(self.force, force, self.dynamics.lag)
@@ -125,6 +133,8 @@ class Traffic(TownRoad):
         # highway-env marks vehicles that will overlap after one more step; they count as crashed now
         self.crashed = [k for k, vehicle in enumerate(self.vehicles) if vehicle.crashed or vehicle.impact is not None]
         self.collided += len(self.crashed)
+        if self.crashed:
+            self.crash_pose = self.pose()
         for slot in self.crashed:
             self._enter(slot)
         self._follow()

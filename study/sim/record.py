@@ -25,6 +25,7 @@ from study.stages import RECORD, Batch, Flow, Task
 FORMAT_VERSION = FORMAT_VERSIONS["episodes"]  # raised when the same settings and seed give another drive
 BEYOND = 60.0  # length of the planned route that is recorded beyond the last position [m]
 STANDING = 0.1  # [m/s]
+SPARE = 50  # columns for vehicles that replace others
 
 
 def record_episode(town: TownSettings, dynamics: DynamicsSettings, recording: RecordingSettings, seed: int) -> Episode:
@@ -38,7 +39,7 @@ def record_episode(town: TownSettings, dynamics: DynamicsSettings, recording: Re
     if steps < 1:
         raise BadInputError(f"recording: a duration of {recording.duration:g} s is shorter than one step of {DT:g} s")
     env = TownEnv({"town": town, "dynamics": dynamics, "seed": seed, "town_seed": recording.seed, "duration": math.inf})
-    recorder = Recorder(env.road)
+    recorder = Recorder(env.road, steps)
     for _ in range(round(recording.warm_up / DT)):
         env.step(None)
         recorder.watch()
@@ -62,12 +63,19 @@ def record_episode(town: TownSettings, dynamics: DynamicsSettings, recording: Re
 
 
 class Recorder:
-    """Observes a road step by step, and makes an Episode of what it has seen."""
+    """Observes a road step by step into arrays of up to `steps` steps, and makes an Episode of what it has seen.
 
-    def __init__(self, road: Traffic) -> None:
+    `arrays` are those of an Episode, with a column for each agent number; they are replaced by wider ones when vehicles
+    with higher numbers come.
+    """
+
+    def __init__(self, road: Traffic, steps: int) -> None:
         self.road = road
         self.standing = np.zeros(len(road.vehicles))  # for how long [s]
-        self.rows: list[dict[str, Any]] = []
+        self.arrays = empty_states(steps, max(road.agents) + SPARE)
+        self.light_state = np.zeros((steps, len(road.town.signals)), np.uint8)
+        self.step = 0  # the next one, or the one between `before` and `after`
+        self.seen: list[dict[str, Any]] = []  # of each step, as it was before rounding
         self.plans: dict[int, tuple[list[int], list[float]]] = {}
         self.collided = road.collided
 
@@ -78,26 +86,46 @@ class Recorder:
         self.collided = self.road.collided
 
     def before(self) -> None:
-        """Record the poses from which the next commands follow."""
-        x, y, heading, speed = self.road.pose()
+        """Record the poses, and what the next commands are based on. Here, and only here, y is turned to point north.
+
+        A full stop leaves a speed of 1e-16 of either sign, which is recorded as 0.
+        """
+        decisions, (x, y, heading, speed) = self.road.decide(), self.road.pose()
         self.standing = np.where(speed < STANDING, self.standing + DT, 0)
-        fleet = self.road.fleet
+        fleet, agents = self.road.fleet, np.array(self.road.agents)
         for slot, agent in enumerate(self.road.agents):
             self.plans.setdefault(agent, (fleet.routes[slot], fleet.starts[slot]))
-        row = {"agent": np.array(self.road.agents), "x": x, "y": y, "heading": heading, "speed": speed}
-        self.rows.append(row | {"standing": self.standing})
+        self.seen.append({"agent": agents, "speed": speed, "standing": self.standing, "route_s": decisions.route_s})
+        self._write("present", values=True)
+        self._write("x", x)
+        self._write("y", -y)
+        self._write("heading", np.mod(-heading + np.pi, 2 * np.pi) - np.pi)
+        self._write("speed", np.maximum(speed, 0))
+        self._write("light", decisions.light)
+        self._write("light_distance", decisions.light_distance)
+        self._write("route_s", decisions.route_s)
+        self._write("lead_gap", np.where(np.isfinite(decisions.lead_gap), decisions.lead_gap, np.nan))
+        self.light_state[self.step] = self.road.light_states
 
     def after(self) -> None:
-        """Record the commands and what they were based on."""
-        decisions, row = self.road.decisions, self.rows[-1]
-        for name in ("steering", "acceleration", "light", "light_distance", "route_s", "lead_gap"):
-            row[name] = getattr(decisions, name)
-        row["light_state"] = self.road.light_states
+        """Record the commands that were followed."""
+        self._write("steering", self.road.decisions.steering)
+        self._write("acceleration", self.road.decisions.acceleration)
+        self.step += 1
+
+    def _write(self, name: str, values: Any) -> None:
+        agents = self.seen[-1]["agent"]
+        steps, columns = self.arrays["x"].shape
+        if agents.max() >= columns:
+            wider = empty_states(steps, 2 * int(agents.max()))
+            for key, old in self.arrays.items():
+                wider[key][:, :columns] = old
+            self.arrays = wider
+        self.arrays[name][self.step, agents] = values
 
     def facts(self, cycle: float) -> dict[str, Any]:
         """Return collisions, the share of vehicle-time standing longer than `cycle` [s], and the mean speed [m/s]."""
-        standing = np.array([row["standing"] for row in self.rows])
-        speed = np.array([row["speed"] for row in self.rows])
+        standing, speed = (np.array([row[name] for row in self.seen]) for name in ("standing", "speed"))
         return {
             "collided_vehicles": self.road.collided - self.collided,
             "standing_longer_than_cycle": round(float((standing > cycle).mean()), 6),
@@ -106,30 +134,23 @@ class Recorder:
         }
 
     def episode(self, name: str, source: dict[str, Any]) -> Episode:
-        """Return the Episode of all recorded steps. Here, and only here, y is turned to point north."""
-        town, rows = self.road.town, self.rows
-        agents = sorted(self.plans)
-        arrays = empty_states(len(rows), len(agents))
-        where = (np.arange(len(rows))[:, None], np.searchsorted(agents, np.array([row["agent"] for row in rows])))
-        seen = {key: np.array([row[key] for row in rows]) for key in rows[0] if key != "agent"}
-        routes, shifts = self._routes(agents, where[1], seen["route_s"])
-        seen["route_s"] = seen["route_s"] - shifts[where[1]]
-        seen["y"], seen["heading"] = -seen["y"], np.mod(-seen["heading"] + np.pi, 2 * np.pi) - np.pi
-        seen["speed"] = np.maximum(seen["speed"], 0)  # a full stop leaves 1e-16 of either sign
-        seen["lead_gap"] = np.where(np.isfinite(seen["lead_gap"]), seen["lead_gap"], np.nan)
-        for key, values in arrays.items():
-            values[where] = True if key == "present" else seen[key]
+        """Return the Episode of all recorded steps."""
+        numbers, s = (np.array([row[name] for row in self.seen[: self.step]]) for name in ("agent", "route_s"))
+        present, columns = np.unique(numbers, return_inverse=True)
+        agents = present.tolist()
+        arrays = {key: values[: self.step, agents] for key, values in self.arrays.items()}
+        routes, shifts = self._routes(agents, columns, s)
+        arrays["route_s"][np.arange(self.step)[:, None], columns] = s - shifts[columns]
+        lanes, lights = town_map(self.road.town)
         return Episode(
             id=name,
             source=source,
             rate_hz=1 / DT,
             labels="recorded",
             agents=tuple(Agent(agent, LENGTH, WIDTH) for agent in agents),
-            lanes=tuple(_lane(town, number) for number in range(len(town.strips))),
-            lights=tuple(
-                Light(number, signal.stop_line * [1, -1], signal.entry) for number, signal in enumerate(town.signals)
-            ),
-            light_state=seen["light_state"],
+            lanes=lanes,
+            lights=lights,
+            light_state=self.light_state[: self.step].copy(),
             routes=routes,
             **arrays,
         )
@@ -145,9 +166,20 @@ class Recorder:
             first = int(np.searchsorted(starts, max(progress.min(), 0.0), side="right")) - 1
             last = int(np.searchsorted(starts, progress.max() + BEYOND))
             shifts[column] = starts[first]
-            line = _line(self.road.town, strips[first:last])
-            lines.append((line * [1, -1]).astype(np.float32))
+            lines.append(route_line(self.road.town, strips[first:last]))
         return tuple(lines), shifts
+
+
+def town_map(town: Town) -> tuple[tuple[Lane, ...], tuple[Light, ...]]:
+    """Return the lanes and lights of a town as an Episode has them."""
+    lanes = tuple(_lane(town, number) for number in range(len(town.strips)))
+    signals = enumerate(town.signals)
+    return lanes, tuple(Light(number, signal.stop_line * [1, -1], signal.entry) for number, signal in signals)
+
+
+def route_line(town: Town, strips: list[int]) -> np.ndarray[Any, Any]:
+    """Return the centre line of joined strips as an Episode has it, [P, 2] float32 m."""
+    return (_line(town, strips) * [1, -1]).astype(np.float32)
 
 
 def _line(town: Town, strips: list[int]) -> Floats:

@@ -15,7 +15,7 @@ from highway_env.road.road import LaneIndex, Road, RoadNetwork
 from highway_env.vehicle.kinematics import Vehicle
 from numpy.typing import NDArray
 
-from study.sim.geometry import Floats, Ints, Piece, Pose
+from study.sim.geometry import Floats, Ints, Piece, Pose, true_pairs
 from study.sim.town import Town, highway_lane
 
 CELL = 4.0  # side of a cell of the grid over the town [m]
@@ -135,12 +135,33 @@ class TownNetwork(RoadNetwork):
 
 
 class TownVehicle(Vehicle):
-    """A vehicle whose lane is looked up together with all the others'."""
+    """A vehicle that is looked up on the map only when something asks for its lane: the autopilot never does."""
 
     def on_state_update(self) -> None:
-        """Leave the lane to the road, which looks up all of them at once."""
+        """Forget the lane of the pose before; without `fast`, look up the new one as highway-env does."""
+        self._lane_index = None
         if not self.road.network.fast:
             super().on_state_update()
+
+    @property
+    def lane_index(self) -> LaneIndex:
+        """Return the closest lane."""
+        if self._lane_index is None:
+            self._lane_index = self.road.network.get_closest_lane_index(self.position, self.heading)
+        return self._lane_index
+
+    @lane_index.setter
+    def lane_index(self, index: LaneIndex) -> None:
+        self._lane_index = index
+
+    @property
+    def lane(self) -> AbstractLane:
+        """Return highway-env's lane of `lane_index`."""
+        return self.road.network.get_lane(self.lane_index)
+
+    @lane.setter
+    def lane(self, lane: AbstractLane) -> None:
+        """Leave the lane to its index."""
 
 
 class TownRoad(Road):
@@ -165,8 +186,7 @@ class TownRoad(Road):
             dx, dy = x[:, None] - x[None], y[:, None] - y[None]
             near = dx * dx + dy * dy < distance * distance
             np.fill_diagonal(near, val=False)
-            i, j = np.nonzero(near)
-            return i, j
+            return true_pairs(near)
         number = {id(vehicle): k for k, vehicle in enumerate(self.vehicles)}
         pairs = [
             (k, number[id(other)])
@@ -177,15 +197,11 @@ class TownRoad(Road):
         return both[:, 0], both[:, 1]
 
     def step(self, dt: float) -> None:
-        """Move every vehicle by `dt` [s], find its lane and handle collisions."""
+        """Move every vehicle by `dt` [s] and handle collisions."""
         if not self.fast:
             super().step(dt)
             return
         pose = self._move(dt)
-        network = self.network
-        lanes = network.closest_lanes(np.stack(pose[:2], axis=1), pose[2])
-        for vehicle, lane in zip(self.vehicles, lanes, strict=True):
-            vehicle.lane_index, vehicle.lane = network.indices[lane], network.lanes[lane]
         for i, j in zip(*self._touching(pose, dt), strict=True):
             self.vehicles[i].handle_collisions(self.vehicles[j], dt)
 
@@ -210,6 +226,7 @@ class TownRoad(Road):
         for k, (vehicle, position, angle, velocity) in enumerate(rows):
             if k not in odd:
                 vehicle.position, vehicle.heading, vehicle.speed = position, angle, velocity
+                vehicle.on_state_update()
         return self.pose() if odd else (place[:, 0], place[:, 1], heading, speed)
 
     def _touching(self, pose: Pose, dt: float) -> tuple[Ints, Ints]:
@@ -217,7 +234,7 @@ class TownRoad(Road):
         x, y, heading, speed = pose
         reach = TownVehicle.LENGTH + TownVehicle.WIDTH + np.abs(speed) * dt  # more than highway-env's two diagonals
         dx, dy = x[:, None] - x[None], y[:, None] - y[None]
-        i, j = np.nonzero(dx * dx + dy * dy < (reach * reach)[:, None])
+        i, j = true_pairs(dx * dx + dy * dy < (reach * reach)[:, None])
         i, j = i[i < j], j[i < j]
         c, s = np.cos(heading), np.sin(heading)
         half_length, half_width = TownVehicle.LENGTH / 2, TownVehicle.WIDTH / 2

@@ -1,0 +1,192 @@
+"""Who drives: the expert, the policies of a cell, and any function."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from study.config.paper import LATENT
+from study.config.settings import SPEEDS
+from study.encoder.inputs import to_float
+from study.encoder.latents import encoder_of
+from study.errors import BadInputError
+from study.policy.networks import WIDTHS, through
+
+Image = NDArray[np.uint8]
+
+
+class Observation(NamedTuple):
+    """What one driver sees: the bird view [64, 64, 3] uint8, the speeds [10] m/s of now and 0.1 s to 0.9 s ago.
+
+    `steering` and `level` are the command of 0.1 s ago, as it was applied; see `Commands`.
+    """
+
+    image: Image
+    speeds: NDArray[np.float32]
+    steering: float
+    level: int
+
+
+class Observations(NamedTuple):
+    """What S drivers see, each in a town of its own; fields as in `Observation`, with S first.
+
+    `driving` [S] bool: a drive that has ended keeps its last observation, so that a batch always has the same size.
+    """
+
+    image: Image
+    speeds: NDArray[np.float32]
+    steering: NDArray[np.float32]
+    level: NDArray[np.int64]
+    driving: NDArray[np.bool_]
+
+    def of(self, driver: int) -> Observation:
+        """Return what one driver sees, for it to keep."""
+        image, speeds = self.image[driver].copy(), self.speeds[driver].copy()
+        return Observation(image, speeds, float(self.steering[driver]), int(self.level[driver]))
+
+
+class Commands(NamedTuple):
+    """Steering labels [S], positive to the left, not yet cropped, and classes of acceleration [S], 0 to 2."""
+
+    steering: NDArray[Any]
+    level: NDArray[Any]
+
+
+class Actor(Protocol):
+    """Drives `drivers` egos at once, each in a town of its own.
+
+    `commands` may raise whatever it likes, and return NaN: the rollout says where. Where `sees` is false, no view is
+    painted. `name` is for people.
+    """
+
+    name: str
+    drivers: int
+    sees: bool
+
+    def commands(self, seen: Observations) -> Commands | None:
+        """Return the commands of all drivers; None leaves the egos to the expert."""
+
+
+@dataclass(frozen=True)
+class Expert:
+    """The autopilot that the policies imitate; `cropped` as their steering is: the best that a policy can do."""
+
+    cropped: bool = False
+    name: str = "expert"
+    drivers: int = 1
+    sees: bool = False
+
+    def commands(self, seen: Observations) -> None:
+        """Leave the egos to the autopilot."""
+
+
+@dataclass(frozen=True)
+class FunctionActor:
+    """A function of an `Observation` that returns steering and class of acceleration."""
+
+    function: Callable[[Observation], tuple[float, int]]
+    name: str = "function"
+    drivers: int = 1
+    sees: bool = True
+
+    def commands(self, seen: Observations) -> Commands:
+        """Call the function for every driver that is still driving."""
+        commands = Commands(np.zeros(self.drivers), np.zeros(self.drivers))
+        for driver in np.flatnonzero(seen.driving).tolist():
+            commands.steering[driver], commands.level[driver] = self.function(seen.of(driver))
+        return commands
+
+
+class PolicyActor:
+    """The S policies of a cell, each at the wheel of its own ego.
+
+    `encode` maps what is seen to latents z [S, 64] float32; `policies` are the weights of a CellResult. The ten speeds
+    follow z where the policies were given them (`policy.inputs`).
+    """
+
+    sees = True
+
+    def __init__(
+        self,
+        name: str,
+        encode: Callable[[Observations], NDArray[np.float32]],
+        policies: Mapping[str, NDArray[Any]],
+    ) -> None:
+        self.name, self._encode = name, encode
+        self._mean, self._std = (torch.from_numpy(np.array(policies[key])) for key in ("z_mean", "z_std"))
+        self._unit_length = bool(policies["z_l2"][0])
+        self._layers = {
+            network: [
+                (
+                    torch.from_numpy(np.array(policies[f"{network}_{layer}_weight"])),
+                    torch.from_numpy(np.array(policies[f"{network}_{layer}_bias"]))[:, None],
+                )
+                for layer in range(len(widths) - 1)
+            ]
+            for network, widths in WIDTHS.items()
+        }
+        self.drivers = len(self._layers["steering"][0][0])
+        if len(self._mean) not in {LATENT, LATENT + SPEEDS}:
+            raise BadInputError(
+                f"{name}: its policies take {len(self._mean)} numbers; a driver has {LATENT} of a latent, or "
+                f"{LATENT + SPEEDS} with its speeds"
+            )
+
+    @torch.inference_mode()
+    def commands(self, seen: Observations) -> Commands:
+        """Return the steering and the likeliest class of each policy; NaN stays NaN, as the class -1."""
+        z = torch.from_numpy(self._encode(seen))
+        if len(self._mean) > LATENT:
+            z = torch.cat([z, torch.from_numpy(seen.speeds)], dim=1)
+        z = (z - self._mean) / self._std
+        if self._unit_length:
+            z = torch.nn.functional.normalize(z, dim=1, eps=torch.finfo(z.dtype).tiny)
+        steering, logits = (self._network(name, z) for name in ("steering", "acceleration"))
+        level = torch.where(logits.isnan().any(dim=1), -1, logits.argmax(dim=1))
+        return Commands(steering[:, 0].numpy(), level.numpy())
+
+    def _network(self, name: str, z: Tensor) -> Tensor:
+        """Return the outputs [S, O] of each policy for its own z."""
+        return through(self._layers[name], z[:, None])[:, 0]
+
+
+def image_encoder(weights: Mapping[str, NDArray[Any]]) -> Callable[[Observations], NDArray[np.float32]]:
+    """Return the function from what is seen to the latents of a trained encoder with these weights."""
+    encoder = encoder_of(weights)
+
+    @torch.inference_mode()
+    def encode(seen: Observations) -> NDArray[np.float32]:
+        z: NDArray[np.float32] = encoder(to_float(torch.from_numpy(seen.image))).float().numpy()
+        return z
+
+    return encode
+
+
+class ExportedActor:
+    """The exported network of a cell (`export_driver`, or `torch.export.load(...).module()`), without our weights.
+
+    It gives every policy's command for every image; a policy follows that for its own. `drivers` is the number of
+    policies in it.
+    """
+
+    sees = True
+
+    def __init__(self, name: str, network: Callable[[Tensor], Mapping[str, Tensor]], drivers: int) -> None:
+        self.name, self.drivers, self._network = name, drivers, network
+
+    @torch.inference_mode()
+    def commands(self, seen: Observations) -> Commands:
+        """Return the steering and the likeliest class of each policy; NaN stays NaN, as the class -1."""
+        images = torch.from_numpy(seen.image)
+        if self.drivers == 1:  # the export takes batches of two and more
+            images = images.repeat(2, 1, 1, 1)
+        outputs, each = self._network(to_float(images)), torch.arange(self.drivers)
+        logits = outputs["acceleration"][each, each]
+        level = torch.where(logits.isnan().any(dim=1), -1, logits.argmax(dim=1))
+        return Commands(outputs["steering"][each, each].numpy(), level.numpy())

@@ -1,0 +1,34 @@
+"""Held-out drives: traffic that neither the encoder set nor the policy set holds, the same list for every actor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from study.config.settings import StudySettings
+from study.data.prepare import POLICY_SEED
+
+STUDY_TOWN = 2 * POLICY_SEED  # held-out drives in the study's town are numbered from here
+UNSEEN_TOWNS = 3 * POLICY_SEED  # and those in towns that no recorded drive is in, one for each drive
+COUNT = 20
+DURATION = 60.0  # [s]
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A drive to be driven for `duration` [s]: traffic, lights, ego and its route from `seed`, the town from its own.
+
+    With `town.per_drive` the town, too, is drawn from `seed`.
+    """
+
+    seed: int
+    town_seed: int
+    duration: float = DURATION
+
+
+def held_out_drives(
+    settings: StudySettings, count: int = COUNT, duration: float = DURATION, *, unseen_towns: bool = False
+) -> tuple[Drive, ...]:
+    """Return the list of drives in the study's town, or that in unseen towns."""
+    first = settings.recording.seed + (UNSEEN_TOWNS if unseen_towns else STUDY_TOWN)
+    town = settings.recording.seed
+    return tuple(Drive(seed, seed if unseen_towns else town, duration) for seed in range(first, first + count))

@@ -1,0 +1,71 @@
+"""Rollouts: an actor drives, and the drive is an Episode like any recorded one."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from study.config.paper import IMAGE, STEERING_CROP
+from study.config.settings import SPEEDS, StudySettings
+from study.driving.actors import Actor, Expert, Observations
+from study.driving.drives import Drive
+from study.driving.ride import Ride
+from study.episode.schema import Episode
+from study.errors import BadInputError
+
+
+class ActorError(BadInputError):
+    """An actor that raised; the message says where."""
+
+
+def rollout(drive: Drive, actor: Actor, settings: StudySettings, *, crop: float = STEERING_CROP) -> list[Episode]:
+    """Return a drive as each of the actor's drivers has driven it, at 10 Hz, all side by side in copies of the town.
+
+    An Episode's `source["drive"]` has the ego's agent number, the step at which the actor took over, and what ended the
+    drive: "time", "collision", "off route", "blocked", or "failure" with its reason. Equal arguments give equal bits.
+    Steering is cropped at `crop`, the paper's by default (Sec. IV-C). In our town that is too little for right turns:
+    the expert itself, cropped there, leaves its way; at 0.42 it does not.
+    Raises ActorError when the actor raises, BadInputError for a town that cannot be drawn.
+    """
+    first = Ride(drive, settings, crop)
+    if actor.sees:
+        first.paint_map()
+    rides = [first, *(first.copy() for _ in range(actor.drivers - 1))]
+    seen = _nothing(actor.drivers)
+    while any(not ride.ended for ride in rides):
+        for place, ride in enumerate(rides):
+            seen.driving[place] = not ride.ended
+            if not ride.ended:
+                ride.observe()
+                seen.speeds[place], seen.steering[place], seen.level[place] = ride.past()
+                if actor.sees:
+                    seen.image[place] = ride.view()
+        _step(rides, actor, seen)
+    return [ride.episode(actor.name, driver) for driver, ride in enumerate(rides)]
+
+
+def _step(rides: list[Ride], actor: Actor, seen: Observations) -> None:
+    try:
+        commands = actor.commands(seen)
+    except Exception as error:
+        place = int(seen.driving.argmax())
+        raise ActorError(
+            f"actor '{actor.name}' raised {type(error).__name__}: {error}; at {rides[place].time:.1f} s of drive "
+            f"{rides[place].drive.seed}"
+        ) from error
+    for place, ride in enumerate(rides):
+        if ride.ended:
+            continue
+        if commands is None:
+            ride.follow(cropped=isinstance(actor, Expert) and actor.cropped)
+        else:
+            ride.act(float(commands.steering[place]), float(commands.level[place]))
+
+
+def _nothing(drivers: int) -> Observations:
+    return Observations(
+        np.zeros((drivers, IMAGE, IMAGE, 3), np.uint8),
+        np.zeros((drivers, SPEEDS), np.float32),
+        np.zeros(drivers, np.float32),
+        np.zeros(drivers, np.int64),
+        np.zeros(drivers, bool),
+    )

@@ -1,0 +1,40 @@
+"""Where boxes of vehicles lie on the lanes of a map."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from study.episode.schema import Lane
+
+Floats = NDArray[np.float64]
+
+CHUNK = 256  # points whose distances are computed together
+
+
+def corners(pose: Floats, length: float, width: float) -> Floats:
+    """Return the corners [..., 4, 2] m of boxes with poses [..., 3 or more]: x, y, heading; the front's come first."""
+    x, y, heading = (pose[..., k, None] for k in range(3))
+    along = np.array([1, 1, -1, -1]) * length / 2
+    aside = np.array([1, -1, -1, 1]) * width / 2
+    c, s = np.cos(heading), np.sin(heading)
+    return np.stack([x + along * c - aside * s, y + along * s + aside * c], axis=-1)
+
+
+def beyond_lanes(points: Floats, lanes: Sequence[Lane]) -> Floats:
+    """Return how far points [P, 2] lie beyond the edge of each lane [P, lanes] m; not above 0 on the lane."""
+    starts = np.concatenate([lane.centre[:-1] for lane in lanes])
+    ways = np.concatenate([np.diff(lane.centre, axis=0) for lane in lanes])
+    first = np.cumsum([0] + [len(lane.centre) - 1 for lane in lanes[:-1]])
+    squares = np.maximum((ways * ways).sum(axis=1), 1e-12)
+    half = np.array([lane.width / 2 for lane in lanes])
+    beyond = np.empty((len(points), len(lanes)))
+    for begin in range(0, len(points), CHUNK):
+        away = points[begin : begin + CHUNK, None] - starts
+        share = ((away * ways).sum(axis=2) / squares).clip(0, 1)
+        away -= share[..., None] * ways
+        distance = np.sqrt((away * away).sum(axis=2))
+        beyond[begin : begin + CHUNK] = np.minimum.reduceat(distance, first, axis=1) - half
+    return beyond
