@@ -58,6 +58,7 @@ class Traffic(TownRoad):
         self.collided = 0  # vehicles since the start
         self.decisions: Decisions  # of the step that `decided` numbers
         self.decided = -1
+        self.decided_pose: Pose  # from which they follow
         streets = [k for k, strip in enumerate(town.strips) if k in town.ways and strip.piece.length > 2 * APART]
         self.streets = np.array(streets or sorted(town.ways), np.int64)
         pieces = [strip.piece for strip in town.strips]
@@ -101,7 +102,7 @@ class Traffic(TownRoad):
     def decide(self) -> Decisions:
         """Return the autopilot's commands for this step, decided once; `act` may replace some."""
         if self.decided < self.steps:
-            pose = self.pose()
+            pose = self.decided_pose = self.pose()
             self.light_states = self.lights.states(self.time)
             self.decisions = self.fleet.decide(
                 self.steps, pose, (self.force, self.wheel), self.pairs_within(REACH, pose), self.light_states
@@ -114,7 +115,7 @@ class Traffic(TownRoad):
         decisions = self.decide()
         for slot, (acceleration, steering) in self.commands.items():
             decisions.acceleration[slot], decisions.steering[slot] = acceleration, steering
-        speed = np.array([vehicle.speed for vehicle in self.vehicles])
+        speed = self.decided_pose[3]
         push = np.where(decisions.acceleration == ACCELERATIONS[1], THROTTLE[0.5], THROTTLE[1.0])
         force = np.where(decisions.acceleration == ACCELERATIONS[0], -BRAKE, push * (1 - speed / TOP_SPEED))
         force = follow_command(self.force, force, self.dynamics.lag)

@@ -90,7 +90,8 @@ class Recorder:
 
         A full stop leaves a speed of 1e-16 of either sign, which is recorded as 0.
         """
-        decisions, (x, y, heading, speed) = self.road.decide(), self.road.pose()
+        decisions = self.road.decide()
+        x, y, heading, speed = self.road.decided_pose
         self.standing = np.where(speed < STANDING, self.standing + DT, 0)
         fleet, agents = self.road.fleet, np.array(self.road.agents)
         for slot, agent in enumerate(self.road.agents):
