@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import resource
 import subprocess
 import sys
 import tempfile
@@ -62,12 +61,22 @@ def write_motorway(folder: Path, steps: int = STEPS, agents: int = AGENTS, alive
     (folder / "episode.json").write_text(json.dumps(head))
 
 
+# The process itself says how much it held: to its parent, it would have held no less than the parent did.
+IMPORT = """
+import sys
+from study.data.__main__ import main
+if code := main(["import", sys.argv[1], "--out", sys.argv[2]]):
+    sys.exit(code)
+print(next(line for line in open("/proc/self/status") if line.startswith("VmHWM")).split()[1])
+"""
+
+
 def import_memory(folder: Path, out: Path) -> tuple[float, int]:
     """Import `folder` in a process of its own; return its seconds and its highest resident memory [bytes]."""
     begin = time.perf_counter()
-    command = [sys.executable, "-m", "study.data", "import", str(folder), "--out", str(out)]
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-    return time.perf_counter() - begin, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024
+    command = [sys.executable, "-c", IMPORT, str(folder), str(out)]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    return time.perf_counter() - begin, int(done.stdout.split()[-1]) * 1024
 
 
 if __name__ == "__main__":
