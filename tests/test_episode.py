@@ -1,17 +1,16 @@
 """An Episode survives writing and reading; what is not one is refused with file, row and field."""
 
 import dataclasses
-import json
 
 import numpy as np
 import pandas as pd
 import pytest
 
 from study.episode.files import FILES, read_episode, write_episode
-from study.episode.head import file_digest
 from study.episode.schema import Episode
 from study.errors import BadInputError
 from tests.support.drives import crossing_drive
+from tests.support.spoil import spoil
 
 STATES = ("x", "y", "heading", "speed", "steering", "acceleration", "light", "light_distance", "route_s", "lead_gap")
 
@@ -30,21 +29,6 @@ def drive() -> Episode:
 def folder(drive, tmp_path):
     write_episode(drive, tmp_path / "drive")
     return tmp_path / "drive"
-
-
-def edit(folder, file, change):
-    """Change a table and set its digest right, as a writer with a fault would."""
-    path = folder / file
-    if file.endswith("parquet"):
-        change(pd.read_parquet(path)).to_parquet(path, index=False)
-    else:
-        content = json.loads(path.read_text())
-        change(content)
-        path.write_text(json.dumps(content))
-    if file != "episode.json":
-        head = json.loads((folder / "episode.json").read_text())
-        head["digests"][file] = file_digest(path)
-        (folder / "episode.json").write_text(json.dumps(head))
 
 
 def test_reading_gives_what_was_written(drive, folder):
@@ -99,14 +83,14 @@ def test_a_truncated_file_is_named(folder, file):
 
 
 def test_optional_columns_may_be_absent(folder):
-    edit(folder, "states.parquet", lambda table: table[["step", "agent", "x", "y", "heading", "speed"]])
+    spoil(folder, "states.parquet", lambda table: table[["step", "agent", "x", "y", "heading", "speed"]])
     read = read_episode(folder)
     assert np.isnan(read.steering).all()
     assert (read.light == -1).all()
 
 
 def test_rows_may_stand_in_any_order(drive, folder):
-    edit(folder, "states.parquet", lambda table: table.sort_values(["agent", "step"], ascending=False))
+    spoil(folder, "states.parquet", lambda table: table.sort_values(["agent", "step"], ascending=False))
     read = read_episode(folder)
     assert np.array_equal(read.present, drive.present)
     assert np.array_equal(read.x[drive.present], drive.x[drive.present])
@@ -137,7 +121,7 @@ def put(field, row, value):
     ],
 )
 def test_wrong_states_are_refused_with_row_and_field(folder, change, words):
-    edit(folder, "states.parquet", change)
+    spoil(folder, "states.parquet", change)
     with pytest.raises(BadInputError) as caught:
         read_episode(folder)
     assert all(word in str(caught.value) for word in ["states.parquet", *words]), caught.value
@@ -155,7 +139,7 @@ def test_wrong_states_are_refused_with_row_and_field(folder, change, words):
     ],
 )
 def test_a_wrong_head_is_refused(folder, change, words):
-    edit(folder, "episode.json", change)
+    spoil(folder, "episode.json", change)
     with pytest.raises(BadInputError) as caught:
         read_episode(folder)
     assert all(word in str(caught.value) for word in words), caught.value
@@ -171,14 +155,14 @@ def test_a_wrong_head_is_refused(folder, change, words):
     ],
 )
 def test_a_wrong_map_is_refused(folder, change, words):
-    edit(folder, "map.json", change)
+    spoil(folder, "map.json", change)
     with pytest.raises(BadInputError) as caught:
         read_episode(folder)
     assert all(word in str(caught.value) for word in words), caught.value
 
 
 def test_a_light_without_a_state_is_refused(folder):
-    edit(folder, "lights.parquet", lambda table: table.iloc[1:])
+    spoil(folder, "lights.parquet", lambda table: table.iloc[1:])
     with pytest.raises(BadInputError, match=r"lights\.parquet.*step 0"):
         read_episode(folder)
 
@@ -189,6 +173,6 @@ def test_a_folder_that_is_none_is_refused(tmp_path):
 
 
 def test_a_light_with_two_states_in_a_step_is_refused(folder):
-    edit(folder, "lights.parquet", lambda table: pd.concat([table, table.iloc[:1]]))
+    spoil(folder, "lights.parquet", lambda table: pd.concat([table, table.iloc[:1]]))
     with pytest.raises(BadInputError, match=r"lights\.parquet, row \d+: light \d+ has two states in step 0"):
         read_episode(folder)

@@ -119,7 +119,7 @@ def test_where_git_does_not_tell_commit_and_changes_are_unknown_with_the_reason(
     assert (facts["commit"], facts["dirty"], facts["diff"]) == (None, None, "")
     assert reason in facts["unknown"]
     assert "/home" not in facts["unknown"]
-    warn_of_unknown_origin(checkout)
+    warn_of_unknown_origin(provenance(checkout))
     assert "warning: the commit is unknown" in capsys.readouterr().err
     assert known(facts, "commit") == known(facts, "dirty") == f"unknown: {facts['unknown']}"
     text = markdown(document(summarise(replace(RECORD, provenance=RECORD.provenance | facts))))
@@ -128,7 +128,7 @@ def test_where_git_does_not_tell_commit_and_changes_are_unknown_with_the_reason(
 
 
 def test_a_known_commit_is_told_without_a_warning(checkout, capsys):
-    warn_of_unknown_origin(checkout)
+    warn_of_unknown_origin(provenance(checkout))
     assert capsys.readouterr().err == ""
     facts = provenance(checkout)
     assert (known(facts, "commit"), known(facts, "dirty")) == (facts["commit"], "false")

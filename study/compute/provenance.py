@@ -16,6 +16,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -33,9 +34,8 @@ class _UnknownError(Exception):
     """Git does not tell what computes here; the text is the reason."""
 
 
-def warn_of_unknown_origin(root: Path = ROOT) -> None:
-    """Say on stderr when the results will not be able to say which code has made them."""
-    origin = provenance(root)
+def warn_of_unknown_origin(origin: Mapping[str, Any]) -> None:
+    """Say on stderr when the results will not be able to say which code has made them; `origin`: of `provenance`."""
     if origin["unknown"]:
         what = "whether the code was changed" if origin["commit"] else "the commit"
         print(f"warning: {what} is unknown, and results will say so: {origin['unknown']}", file=sys.stderr)

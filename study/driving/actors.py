@@ -13,10 +13,10 @@ from torch import Tensor
 
 from study.config.paper import LATENT
 from study.config.settings import SPEEDS
+from study.driving.driver import Policies
 from study.encoder.inputs import to_float
 from study.encoder.latents import encoder_of
 from study.errors import BadInputError
-from study.policy.networks import WIDTHS, through
 
 Image = NDArray[np.uint8]
 
@@ -118,42 +118,28 @@ class PolicyActor:
         encode: Callable[[Observations], NDArray[np.float32]],
         policies: Mapping[str, NDArray[Any]],
     ) -> None:
-        self.name, self._encode = name, encode
-        self._mean, self._std = (torch.from_numpy(np.array(policies[key])) for key in ("z_mean", "z_std"))
-        self._unit_length = bool(policies["z_l2"][0])
-        self._layers = {
-            network: [
-                (
-                    torch.from_numpy(np.array(policies[f"{network}_{layer}_weight"])),
-                    torch.from_numpy(np.array(policies[f"{network}_{layer}_bias"]))[:, None],
-                )
-                for layer in range(len(widths) - 1)
-            ]
-            for network, widths in WIDTHS.items()
-        }
-        self.drivers = len(self._layers["steering"][0][0])
-        if len(self._mean) not in {LATENT, LATENT + SPEEDS}:
+        self.name, self._encode, self._policies = name, encode, Policies(policies)
+        self.drivers, self._width = len(policies["steering_0_weight"]), len(policies["z_mean"])
+        if self._width not in {LATENT, LATENT + SPEEDS}:
             raise BadInputError(
-                f"{name}: its policies take {len(self._mean)} numbers; a driver has {LATENT} of a latent, or "
+                f"{name}: its policies take {self._width} numbers; a driver has {LATENT} of a latent, or "
                 f"{LATENT + SPEEDS} with its speeds"
             )
 
     @torch.inference_mode()
     def commands(self, seen: Observations) -> Commands:
-        """Return the steering and the likeliest class of each policy; NaN stays NaN, as the class -1."""
+        """Return the steering and the likeliest class of each policy."""
         z = torch.from_numpy(self._encode(seen))
-        if len(self._mean) > LATENT:
+        if self._width > LATENT:
             z = torch.cat([z, torch.from_numpy(seen.speeds)], dim=1)
-        z = (z - self._mean) / self._std
-        if self._unit_length:
-            z = torch.nn.functional.normalize(z, dim=1, eps=torch.finfo(z.dtype).tiny)
-        steering, logits = (self._network(name, z) for name in ("steering", "acceleration"))
-        level = torch.where(logits.isnan().any(dim=1), -1, logits.argmax(dim=1))
-        return Commands(steering[:, 0].numpy(), level.numpy())
+        outputs = self._policies.decide(z[:, None])
+        return _commands(outputs["steering"][:, 0], outputs["acceleration"][:, 0])
 
-    def _network(self, name: str, z: Tensor) -> Tensor:
-        """Return the outputs [S, O] of each policy for its own z."""
-        return through(self._layers[name], z[:, None])[:, 0]
+
+def _commands(steering: Tensor, logits: Tensor) -> Commands:
+    """Return the steering [S] and the likeliest class of logits [S, 3]; NaN stays NaN, as the class -1."""
+    level = torch.where(logits.isnan().any(dim=1), -1, logits.argmax(dim=1))
+    return Commands(steering.numpy(), level.numpy())
 
 
 def image_encoder(weights: Mapping[str, NDArray[Any]]) -> Callable[[Observations], NDArray[np.float32]]:
@@ -182,11 +168,9 @@ class ExportedActor:
 
     @torch.inference_mode()
     def commands(self, seen: Observations) -> Commands:
-        """Return the steering and the likeliest class of each policy; NaN stays NaN, as the class -1."""
+        """Return the steering and the likeliest class of each policy."""
         images = torch.from_numpy(seen.image)
         if self.drivers == 1:  # the export takes batches of two and more
             images = images.repeat(2, 1, 1, 1)
         outputs, each = self._network(to_float(images)), torch.arange(self.drivers)
-        logits = outputs["acceleration"][each, each]
-        level = torch.where(logits.isnan().any(dim=1), -1, logits.argmax(dim=1))
-        return Commands(outputs["steering"][each, each].numpy(), level.numpy())
+        return _commands(outputs["steering"][each, each], outputs["acceleration"][each, each])

@@ -22,26 +22,24 @@ from study.policy.networks import WIDTHS, through
 from study.results.cell_result import CellResult
 
 
-class Driver(nn.Module):
-    """An encoder and the S policies on it.
+class Policies(nn.Module):
+    """The S policies on an encoder, with the weights of a CellResult."""
 
-    Images [B, 3, 64, 64] float32 in [0, 1] -> "steering" [S, B] and "acceleration" [S, B, 3] float32, the logits of the
-    classes ACCELERATIONS, without dropout.
-    """
-
-    def __init__(self, encoder: Mapping[str, NDArray[Any]], policies: Mapping[str, NDArray[Any]]) -> None:
+    def __init__(self, policies: Mapping[str, NDArray[Any]]) -> None:
         super().__init__()
-        self.encoder = encoder_of(encoder)
         self.unit_length = bool(policies["z_l2"][0])
         for name, value in policies.items():
             if name != "z_l2":
                 self.register_buffer(name, torch.from_numpy(np.array(value)))
 
-    def forward(self, images: Tensor) -> dict[str, Tensor]:
-        """Return the commands of all policies for images."""
-        z = (self.encoder(images) - self.get_buffer("z_mean")) / self.get_buffer("z_std")
+    def decide(self, z: Tensor) -> dict[str, Tensor]:
+        """Return the commands of all policies for z [B, Z], or each policy's for its own z [S, 1, Z].
+
+        "steering" [S, B] and "acceleration" [S, B, 3] float32, the logits of ACCELERATIONS, without dropout.
+        """
+        z = (z - self.get_buffer("z_mean")) / self.get_buffer("z_std")
         if self.unit_length:
-            z = nn.functional.normalize(z, dim=1, eps=torch.finfo(z.dtype).tiny)
+            z = nn.functional.normalize(z, dim=-1, eps=torch.finfo(z.dtype).tiny)
         outputs = {
             name: through(
                 [
@@ -53,6 +51,18 @@ class Driver(nn.Module):
             for name, widths in WIDTHS.items()
         }
         return {"steering": outputs["steering"][..., 0], "acceleration": outputs["acceleration"]}
+
+
+class Driver(Policies):
+    """An encoder and the policies on it: images [B, 3, 64, 64] float32 in [0, 1] to the commands of `decide`."""
+
+    def __init__(self, encoder: Mapping[str, NDArray[Any]], policies: Mapping[str, NDArray[Any]]) -> None:
+        super().__init__(policies)
+        self.encoder = encoder_of(encoder)
+
+    def forward(self, images: Tensor) -> dict[str, Tensor]:
+        """Return the commands of all policies for images."""
+        return self.decide(self.encoder(images))
 
 
 def export_driver(result: CellResult) -> bytes:

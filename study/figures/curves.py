@@ -189,14 +189,7 @@ def _label_ends(axes: Axes, ends: Sequence[End]) -> None:
             va="center",
             fontsize=7,
             annotation_clip=False,
-            arrowprops={
-                "arrowstyle": "-",
-                "color": colour,
-                "linewidth": 0.5,
-                "shrinkA": 1,
-                "shrinkB": 0,
-                "relpos": (0, 0.5),
-            },
+            arrowprops={**LEADER, "color": colour},
         )
 
 

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from study.compute.provenance import provenance
 from study.driving.driver import export_driver
 from study.errors import BadInputError
 from study.results.cell_result import CellResult, load_results
@@ -55,7 +56,7 @@ def take_in(plan: Plan, folder: Path, keys: Sequence[str], tracker: Tracker) -> 
     """
     data = _manifest(plan, folder)
     done = tracker.reader.finished(list(plan.cells))
-    sweep_run = open_sweep(plan, data, tracker)
+    sweep_run = open_sweep(plan, data, tracker, provenance())
     missing = list(plan.cells)
     try:
         for key in keys:

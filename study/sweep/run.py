@@ -37,10 +37,11 @@ from study.tracking.tracker import Tracker
 
 def execute(plan: Plan, options: RunOptions, command: str, *, report: bool) -> int:
     """Run what is not finished, then write the report unless told not to. Returns the exit code."""
-    warn_of_unknown_origin()
+    origin = provenance()
+    warn_of_unknown_origin(origin)
     with hold_store(plan, options.tracking, wait=options.wait):
         tracker = Tracker(options.tracking)
-        failed = run_cells(plan, options, tracker)
+        failed = run_cells(plan, options, tracker, origin)
         try:
             if report:
                 print("writing the report", file=sys.stderr)
@@ -62,7 +63,7 @@ def write_report(plan: Plan, tracker: Tracker) -> None:
     print(f"report: {publish(tracker, plan.grid.name, plan.profile, plan.workspace.reports)}", file=sys.stderr)
 
 
-def run_cells(plan: Plan, options: RunOptions, tracker: Tracker) -> dict[str, str]:
+def run_cells(plan: Plan, options: RunOptions, tracker: Tracker, origin: dict[str, Any]) -> dict[str, str]:
     """Train what is not finished, until every cell is finished or has failed. Returns the failed, with reasons."""
     done = tracker.reader.finished(list(plan.cells))
     given_up = {} if options.retry_failed else tracker.reader.given_up(set(plan.cells) - set(done))
@@ -77,7 +78,7 @@ def run_cells(plan: Plan, options: RunOptions, tracker: Tracker) -> dict[str, st
             data, card = run_flow(_data_flow(plan, engine), engine, display.data)
         else:
             data, card = _describe_here(plan) if plan.frames_ready else ({}, {})
-        sweep_run = open_sweep(plan, data, tracker)
+        sweep_run = open_sweep(plan, data, tracker, origin)
         with Committing(plan, options, tracker, sweep_run, order, display, engine.gpus() > 0) as cells:
             with tempfile.TemporaryDirectory() as name:
                 files = [Path(name) / file for file in card]
@@ -90,11 +91,11 @@ def run_cells(plan: Plan, options: RunOptions, tracker: Tracker) -> dict[str, st
             return given_up | cells.close()
 
 
-def open_sweep(plan: Plan, data: dict[str, Any], tracker: Tracker) -> str:
+def open_sweep(plan: Plan, data: dict[str, Any], tracker: Tracker, origin: dict[str, Any]) -> str:
     """Open the sweep's run, with the manifest of its frames; returns the run's identifier."""
     if plan.imported:
         data = data | {"writers": plan.imported.writers}  # a report must not call these drives our town's
-    origin = provenance() | {"command": plan.command}
+    origin = origin | {"command": plan.command}
     return tracker.open_sweep(plan.grid, plan.profile, plan.settings, plan.cells, data, origin)
 
 

@@ -22,7 +22,7 @@ from filelock import FileLock, Timeout
 from study.cell.flow import cell_flow, product_folders
 from study.cell.job import CellJob
 from study.compute.gpus import visible_gpus
-from study.compute.provenance import cores, warn_of_unknown_origin
+from study.compute.provenance import cores, provenance, warn_of_unknown_origin
 from study.console.display import Display
 from study.data.prepare import data_flow
 from study.engine.flows import Listener, run_flow, run_flows
@@ -46,7 +46,7 @@ def train(plan: Plan, out: Path, device: str, threads: int) -> int:
     jobs = {key: job for key, job in cell_jobs(plan, device, threads).items() if not (out / key).is_dir()}
     if not jobs:
         return 0
-    warn_of_unknown_origin()
+    warn_of_unknown_origin(provenance())
     plan.workspace.data.mkdir(exist_ok=True)
     gpus = visible_gpus(device)
     with plan_display(plan, jobs) as display, _engine(plan, gpus, threads) as engine:
