@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save
 
-from study.atomic import atomic_folder
+from study.atomic import atomic_folder, twice_if_swept
 from study.errors import BadInputError
 
 Arrays = dict[str, NDArray[Any]]
@@ -35,15 +35,19 @@ def write_product(
     folder: Path, head_file: str, head: Mapping[str, Any], parts: Mapping[str, Arrays], table: pd.DataFrame
 ) -> Path:
     """Write a folder with the head as JSON, one safetensors file for each part, and the table."""
-    with atomic_folder(folder) as draft:
-        for part, arrays in parts.items():
-            # Not `save_file`, whose error for a full disk is no OSError.
-            content = save({key: np.ascontiguousarray(value) for key, value in arrays.items()})
-            (draft / f"{part}.safetensors").write_bytes(content)
-        table.to_parquet(draft / TABLE, index=False)
-        digests = {file.name: _digest(file) for file in sorted(draft.iterdir())}
-        (draft / head_file).write_text(json.dumps({**head, "digests": digests}, indent=1), encoding="utf-8")
-    return folder
+
+    def write() -> Path:
+        with atomic_folder(folder) as draft:
+            for part, arrays in parts.items():
+                # Not `save_file`, whose error for a full disk is no OSError.
+                content = save({key: np.ascontiguousarray(value) for key, value in arrays.items()})
+                (draft / f"{part}.safetensors").write_bytes(content)
+            table.to_parquet(draft / TABLE, index=False)
+            digests = {file.name: _digest(file) for file in sorted(draft.iterdir())}
+            (draft / head_file).write_text(json.dumps({**head, "digests": digests}, indent=1), encoding="utf-8")
+        return folder
+
+    return twice_if_swept(write)
 
 
 def read_product(

@@ -9,12 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Generator
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from study.cell.job import CellJob
+from study.engine.room import with_room
 from study.errors import BadInputError
 from study.products import Product, read_product, write_product
 from study.results.cell_result import CellResult
@@ -68,6 +70,7 @@ def _keep(folders: list[Path], parts: tuple[str, ...], tasks: list[Task]) -> Gen
     missing = {folder: task for folder, task in zip(folders, tasks, strict=True) if folder not in products}
     before = sum(task.weight for folder, task in zip(folders, tasks, strict=True) if folder in products)
     for folder, product in zip(missing, (yield Batch(list(missing.values()), before)), strict=True):
-        write_product(folder, HEAD, {"facts": product.facts}, product.parts, product.curves)
+        facts = {"facts": product.facts}
+        with_room(partial(write_product, folder, HEAD, facts, product.parts, product.curves))
         products[folder] = product
     return [products[folder] for folder in folders]

@@ -15,10 +15,11 @@ import re
 import shutil
 import subprocess
 import sys
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+
+from study.atomic import scratch_folder
 
 ROOT = Path(__file__).resolve().parents[2]
 DIFF_LIMIT = 1_000_000  # bytes
@@ -139,7 +140,7 @@ def _reason(words: str) -> str:
 def _diff(root: Path) -> str:
     """Return the working tree against HEAD, new source files included, without touching the index."""
     index = root / _git(root, "rev-parse", "--git-path", "index").strip()
-    with tempfile.TemporaryDirectory() as folder:
+    with scratch_folder() as folder:
         draft = Path(folder) / "index"
         if index.is_file():
             shutil.copyfile(index, draft)

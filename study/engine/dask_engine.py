@@ -24,7 +24,8 @@ import dask
 from distributed import CancelledError, Client, Future, KilledWorker, get_worker
 
 from study.console.interrupts import check_stopped
-from study.engine.flows import TRIES, WAIT
+from study.engine.flows import WAIT
+from study.engine.room import TRIES
 from study.engine.tasks import Failure, Hear, perform
 from study.errors import BadInputError
 from study.stages import Task

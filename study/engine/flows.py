@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import sys
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -14,11 +15,11 @@ from typing import Any, TypeVar
 
 from study.console.interrupts import check_stopped
 from study.engine.inline import InlineEngine
+from study.engine.room import TRIES
 from study.engine.tasks import Engine, Failure, failure_of
 from study.errors import BadInputError, TrainingDivergedError
 from study.stages import Batch, Flow, Task
 
-TRIES = 3
 WAIT = 0.5  # [s] between two looks at Ctrl-C, the display and the cluster's size
 
 T = TypeVar("T")
@@ -99,6 +100,7 @@ class _Runner:
         self._engine, self._next_flow, self._listener = engine, next_flow, listener
         self._ready: list[_Attempt] = []  # in the order in which they should run: earlier flows first
         self._submitted: dict[int, _Attempt] = {}
+        self._full: set[str] = set()  # where room is waited for
         self._task_numbers, self._flow_numbers = itertools.count(), itertools.count()
 
     def run(self) -> None:
@@ -155,6 +157,7 @@ class _Runner:
     def _end_task(self, attempt: _Attempt, value: Any) -> None:
         running = attempt.running
         if not isinstance(value, Failure):
+            self._full.clear()
             running.results[attempt.index] = value
             running.shares[attempt.index] = 1.0
             self._listener.progress(*running.progress())
@@ -180,6 +183,11 @@ class _Runner:
             listener.started(running.name, *values)
         elif kind == "device":
             listener.device(running.name, *values)
+        elif kind == "room":
+            place, words = values
+            if place not in self._full:  # tasks that fail beside each other wait for the same
+                listener.retry(running.name, words)
+            self._full.add(place)
         elif kind == "progress":
             done, running.total = values
             running.shares[attempt.index] = done / max(running.total, 1)
@@ -206,6 +214,11 @@ def run_flow(flow: Flow[T], engine: Engine | None = None, progress: Progress = i
     def fail(_: str, failure: Failure) -> None:
         raise BadInputError(failure.reason) if failure.expected else FlowFailedError(failure.reason)
 
-    listener = Listener(lambda _, product: products.append(product), fail, lambda _, *step: progress(*step))
+    def retry(_: str, reason: str) -> None:
+        print(f"{reason.strip().splitlines()[-1]}; it will be tried again", file=sys.stderr, flush=True)
+
+    listener = Listener(
+        lambda _, product: products.append(product), fail, lambda _, *step: progress(*step), retry=retry
+    )
     run_flows(engine or InlineEngine(), lambda: next(flows, None), listener)
     return products[0]

@@ -10,7 +10,8 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from study.errors import BadInputError, TrainingDivergedError, write_failure
+from study.engine.room import with_room
+from study.errors import BadInputError, TrainingDivergedError, full_place, write_failure
 from study.stages import Task
 
 NO_MEMORY = ("out of memory", "can't allocate memory")  # in torch's RuntimeErrors of GPUs and CPUs
@@ -55,22 +56,23 @@ class Engine(Protocol):
 
 
 def perform(task: Task, report: Callable[..., None]) -> Any:
-    """Run a task in this process and return its value, or a Failure."""
+    """Run a task in this process and return its value, or a Failure. Where a disk is full, wait for room."""
     report("start", platform.node(), os.getpid())
     try:
         function = pkgutil.resolve_name(task.function) if isinstance(task.function, str) else task.function
-        return function(*task.args, *([report] if task.reports else []))
+        arguments = [*task.args, *([report] if task.reports else [])]
+        return with_room(lambda: function(*arguments), lambda *words: report("room", *words))
     except Exception as error:  # noqa: BLE001 - any error is this task's, and the others go on
         return failure_of(error)
 
 
 def failure_of(error: Exception) -> Failure:
     """Return what an exception means: whether another try may succeed, and the reason."""
-    problem = write_failure(error)
+    problem, full = write_failure(error), full_place(error) is not None  # room was waited for
     if isinstance(error, BadInputError | TrainingDivergedError):
-        return Failure(str(error), transient=problem is not None)
+        return Failure(str(error), transient=problem is not None, exhausted=full)
     if problem:
-        return Failure(problem, transient=True)
+        return Failure(problem, transient=True, exhausted=full)
     no_memory = isinstance(error, RuntimeError) and any(words in str(error).lower() for words in NO_MEMORY)
     transient = isinstance(error, OSError | MemoryError) or no_memory
     return Failure("".join(traceback.format_exception(error)), transient, expected=False)

@@ -17,6 +17,7 @@ from study.config.workspace import Workspace
 from study.console.display import Display
 from study.console.interrupts import check_stopped
 from study.engine.flows import Listener
+from study.engine.room import with_room
 from study.engine.tasks import Failure
 from study.engine.trials import Trials
 from study.errors import BadInputError, masked
@@ -160,7 +161,7 @@ class Committing:
             return self._patiently(action, *args, **kwargs)
 
     def _patiently(self, action: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Do something that can be done again, and wait for a server that is away meanwhile."""
+        """Do something that can be done again, and wait for a server that is away meanwhile, or for room on a disk."""
 
         def say(state: RetryCallState) -> None:
             check_stopped()
@@ -168,13 +169,14 @@ class Committing:
                 minutes = self._patience / 60
                 self._display.say(f"{state.outcome.exception()}; trying again for {minutes:.0f} minutes")
 
-        return Retrying(
+        tries = Retrying(
             retry=retry_if_exception_type(TrackerLostError),
             stop=stop_after_delay(self._patience),
             wait=wait_fixed(RETRY),
             before_sleep=say,
             reraise=True,
-        )(action, *args, **kwargs)
+        )
+        return with_room(lambda: tries(action, *args, **kwargs))
 
     def __enter__(self) -> Self:
         return self

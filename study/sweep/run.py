@@ -14,6 +14,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
+from study.atomic import scratch_folder
 from study.compute.gpus import visible_gpus
 from study.compute.provenance import cores, provenance, warn_of_unknown_origin
 from study.config.workspace import Workspace
@@ -80,7 +81,7 @@ def run_cells(plan: Plan, options: RunOptions, tracker: Tracker, origin: dict[st
             data, card = _describe_here(plan) if plan.frames_ready else ({}, {})
         sweep_run = open_sweep(plan, data, tracker, origin)
         with Committing(plan, options, tracker, sweep_run, order, display, engine.gpus() > 0) as cells:
-            with tempfile.TemporaryDirectory() as name:
+            with scratch_folder() as name:
                 files = [Path(name) / file for file in card]
                 for file in files:
                     file.write_bytes(card[file.name])

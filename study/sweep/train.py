@@ -54,7 +54,9 @@ def train(plan: Plan, out: Path, device: str, threads: int) -> int:
         shutil.copyfile(plan.frames / "manifest.json", out / f"frames-{plan.frames.name}.json")
         saving = _Saving(out, jobs, display, one_share=bool(gpus))
         run_flows(
-            engine, saving.next_flow, Listener(saving.finished, saving.failed, display.progress, tick=display.tick)
+            engine,
+            saving.next_flow,
+            Listener(saving.finished, saving.failed, display.progress, retry=saving.retry, tick=display.tick),
         )
     for key, reason in saving.reasons.items():
         print(f"failed: {plan.cells[key].label} ({key}): {reason.strip()}", file=sys.stderr)
@@ -103,6 +105,11 @@ class _Saving:
             shutil.rmtree(folder, ignore_errors=True)
         self._display.finish(name)
         self._locks.pop(name).release()
+
+    def retry(self, name: str, reason: str) -> None:
+        """Say that a task will be tried again."""
+        line = reason.strip().splitlines()[-1]
+        self._display.say(f"{self._jobs[name].cell.label}: {line}; it will be tried again")
 
     def failed(self, name: str, failure: Failure) -> None:
         """Keep the reason."""

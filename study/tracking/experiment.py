@@ -9,7 +9,6 @@ import platform
 import re
 import shutil
 import sqlite3
-import tempfile
 import urllib.error
 import urllib.parse
 import urllib.request
@@ -26,6 +25,7 @@ from mlflow.exceptions import MlflowException
 from mlflow.tracking import MlflowClient
 from sqlalchemy.exc import SQLAlchemyError  # MLflow depends on sqlalchemy and lets its errors through
 
+from study.atomic import scratch_folder
 from study.config.workspace import HERE
 from study.errors import BadInputError, masked
 from study.tracking.run_page import experiment_tags
@@ -99,7 +99,7 @@ class Experiment:
 
     def read_text(self, run_id: str, artifact: str) -> str:
         """Return the content of a text artifact. Raises as `download`."""
-        with tempfile.TemporaryDirectory() as folder:
+        with scratch_folder() as folder:
             return self.download(run_id, artifact, folder).read_text(encoding="utf-8", errors="replace")
 
     def read_json(self, run_id: str, artifact: str) -> dict[str, Any]:

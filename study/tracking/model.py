@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,7 @@ from mlflow.models import Model, ModelSignature
 from mlflow.tracking import MlflowClient
 from mlflow.types import Schema, TensorSpec
 
+from study.atomic import scratch_folder
 from study.config.paper import ACCELERATIONS, IMAGE
 from study.results.cell_result import CellResult
 
@@ -64,7 +64,7 @@ def log_model(client: MlflowClient, experiment: str, run_id: str, result: CellRe
         cell = result.cell.model_dump(mode="json") | {"policy_seeds": len(result.policies["steering_2_bias"])}
         params = {name: str(value) for name, value in cell.items()}
         model_id = str(client.create_logged_model(experiment, MODEL, run_id, {}, params, TYPE).model_id)
-    with tempfile.TemporaryDirectory() as name:
+    with scratch_folder() as name:
         folder = Path(name) / MODEL
         write_model(folder, result, network, run_id, model_id)
         client.log_model_artifacts(model_id, str(folder))

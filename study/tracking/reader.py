@@ -5,13 +5,13 @@ A cell is done when its run is FINISHED with its `cell_key`, whichever sweep has
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
 from mlflow.entities import Run
 
+from study.atomic import scratch_folder
 from study.config.grid import Cell, Grid
 from study.config.settings import StudySettings
 from study.config.workspace import HERE
@@ -88,7 +88,7 @@ class Reader:
 
     def load_result(self, run_id: str) -> CellResult:
         """Return the result that a finished cell run holds. Raises UnreadableError when it is missing or damaged."""
-        with self.experiment.guard(), tempfile.TemporaryDirectory() as folder:
+        with self.experiment.guard(), scratch_folder() as folder:
             key = self.experiment.client.get_run(run_id).data.tags.get("cell_key")
             try:
                 result = CellResult.load(self.experiment.download(run_id, RESULT, folder))

@@ -16,7 +16,6 @@ import json
 import math
 import os
 import platform
-import tempfile
 import time
 from collections.abc import Iterable, Mapping
 from contextlib import nullcontext, suppress
@@ -26,6 +25,7 @@ from typing import Any
 import pandas as pd
 from mlflow.entities import Dataset, DatasetInput, InputTag, Metric, Param, Run, RunTag
 
+from study.atomic import scratch_folder
 from study.config.grid import Cell, Grid
 from study.config.keys import content_key
 from study.config.settings import StudySettings
@@ -219,7 +219,7 @@ class Tracker:
             if winner != cell_run.run_id:
                 self._close_run(cell_run.run_id, "KILLED", {"superseded_by": winner})
                 return winner
-            with tempfile.TemporaryDirectory() as folder:
+            with scratch_folder() as folder:
                 self.client.log_artifacts(cell_run.run_id, str(result.save(Path(folder) / RESULT)), RESULT)
             if diff := result.facts.get("provenance", {}).get("diff"):
                 self.client.log_text(cell_run.run_id, diff, "uncommitted.diff")
