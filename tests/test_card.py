@@ -1,6 +1,8 @@
 """The data card: numbers, text and figure of a frame store and its drives."""
 
 import json
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -11,7 +13,9 @@ from study.data.birdview import MASK_BYTES
 from study.data.card import _others, _twins, card_files, card_text, make_card, nearest_frames, thumbnails, write_card
 from study.data.frames import Frames, open_frames
 from study.episode.files import read_episode
-from study.figures.data_card import data_card
+from study.figures.data_card import data_card, headline
+from study.figures.fonts import fonts_for
+from tests.support.spoil import spoil
 
 VIEW = BirdviewSettings()
 
@@ -105,6 +109,27 @@ def test_a_split_by_frame_finds_the_twins_that_a_split_by_drive_keeps_apart():
     assert twins["frame"]["twins"] > 0.95
     assert twins["frame"]["same_drive"] > 0.95
     assert twins["frame"]["test"] == twins["episode"]["test"] == 80
+
+
+def written_by(drives, writer, folder):
+    """Return copies of drives by another writer; their frames are the same."""
+    copies = [Path(shutil.copytree(drive, folder / drive.parent.name / drive.name)) for drive in drives]
+    for copy in copies:
+        spoil(copy, "episode.json", lambda head: head["source"].update(writer=writer))
+    return copies
+
+
+def test_a_writer_in_any_script_is_in_the_title_or_the_missing_characters_are_named(
+    small_store, small_drives, tmp_path, capsys
+):
+    """DejaVu Sans has Georgian; nobody has a character of the private planes; dollars are no formula."""
+    store = open_frames(small_store)
+    for name, missing in (("ქართული $x_$\nlab", False), ("script \U00016b50", True)):
+        drives = written_by(small_drives, name, tmp_path / str(missing))
+        write_card(store, drives, tmp_path)
+        assert f"written by {' '.join(name.split())}" in headline(make_card(store, drives))
+        lacks = missing and fonts_for(name).missing  # a machine may have the font
+        assert ("U+16B50" in capsys.readouterr().err) == bool(lacks)
 
 
 def test_frames_of_a_single_drive_are_split_by_frame_only(small_store, small_drives):

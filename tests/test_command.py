@@ -12,7 +12,9 @@ import pytest
 from study.config.baselines import BASELINES
 from study.console.interrupts import STOP_SECONDS, check_stopped, stoppable
 from study.console.options import run
-from study.errors import EXIT_AGAIN, EXIT_BAD_INPUT, EXIT_INTERRUPTED
+from study.data.__main__ import main as data
+from study.errors import EXIT_AGAIN, EXIT_BAD_INPUT, EXIT_INTERRUPTED, BadInputError
+from study.report.__main__ import main as report
 from tests.support.processes import sweep
 from tests.support.sweeps import working_folder
 
@@ -45,7 +47,14 @@ def folder(tmp_path_factory):
         (["heads", "--cluster", "somewhere"], "tls://host:8786"),
         (["heads", "--cluster", "tcp://127.0.0.1:1", "--workers", "2"], "leave one of them out"),
         (["heads", "--dry-run", "--tracking=postgresql://me:secret@host/db"], "postgresql://***@host/db"),
-        (["verify", "heads", "--retry-failed"], "No such option '--retry-failed'"),
+        (["verify", "heads", "--retry-failed"], "it goes with python -m study.sweep: leave it out here"),
+        (
+            ["verify", "heads", "--threads", "2"],
+            "it goes with python -m study.sweep, python -m study.sweep train: leave",
+        ),
+        (["verify", "heads", "--workers", "2"], "no cell of heads"),
+        (["status", "heads", "--cell", "x"], "it goes with python -m study.sweep verify: leave it out here"),
+        (["train", "heads", "--out", "out", "--tracking", "x"], "it goes with python -m study.sweep, "),
         ([], "NAME"),
     ],
 )
@@ -56,6 +65,25 @@ def test_bad_input_is_one_clear_error_exit_code_2_and_leaves_nothing(folder, wor
     assert "secret" not in completed.stderr
     assert "Traceback" not in completed.stderr
     assert {path.name for path in folder.iterdir()} == {"sweeps"}
+
+
+@pytest.mark.parametrize(
+    "words", [["--workers", "2"], ["--encoder.epochs", "5"], ["--retry-failed"], ["--device", "cpu"]]
+)
+def test_a_report_says_where_options_of_a_run_go(words):
+    for command in (["heads", *words], ["compare", "heads", "heads", *words]):
+        with pytest.raises(BadInputError, match=r"No such option.*go with python -m study.sweep: a report takes"):
+            report(command)
+
+
+def test_a_misspelt_option_is_told_the_right_one():
+    with pytest.raises(BadInputError, match=r"Did you mean.*--format"):
+        report(["heads", "--formt", "md"])
+
+
+def test_an_option_of_another_data_command_is_named():
+    with pytest.raises(BadInputError, match=r"it goes with python -m study\.data import: leave it out here"):
+        data(["card", "--drop-bad"])
 
 
 def test_dry_run_speaks_json(folder):

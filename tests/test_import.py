@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import shutil
 from pathlib import Path
 
@@ -180,6 +181,58 @@ def test_steering_to_the_other_side_is_refused(log):
     assert "left is positive" in message
 
 
+def bends(factor, length=4.6):
+    """Return a change: each agent drives curves of 30 to 300 m; steering is the wheel angle [rad], times a factor."""
+
+    def change(table):
+        parts = []
+        for number, part in table.groupby("agent"):
+            time = np.arange(len(part)) / 10
+            speed = 12.0
+            bend = np.sin(time * (0.8 + 0.1 * (number % 5))) / 30  # [1/m]
+            heading = np.concatenate([[0.0], np.cumsum(bend[:-1] * speed / 10)])
+            heading -= heading.mean() + np.pi / 2 * (number % 4)
+            at = [np.concatenate([[0.0], np.cumsum(way(heading[:-1]) * speed / 10)]) for way in (np.cos, np.sin)]
+            parts.append(
+                part.assign(
+                    x=part.x.iloc[0] + at[0],
+                    y=part.y.iloc[0] + at[1],
+                    heading=heading,
+                    speed=speed,
+                    steering=np.arctan(length * bend) * factor,
+                )
+            )
+        return pd.concat(parts).astype(table.dtypes)
+
+    return change
+
+
+def steering_findings(log, change):
+    spoil(log / "drive-001", STATES, change)
+    return [finding for finding in check_drives(log) if "'steering'" in str(finding)]
+
+
+@pytest.mark.parametrize("wheelbase", [2.8, 4.8])  # of cars, and of simulators that take the length for it
+def test_steering_in_radians_is_a_warning_with_the_share_of_values(log, wheelbase):
+    assert steering_findings(log, bends(1 / 1.22, wheelbase)) == []
+    (finding,) = steering_findings(log, bends(1.0, wheelbase))
+    assert finding.warning
+    share = int(re.search(r"(\d+)% of the values in bends, and 4 of 4 agents, look like .* radians", str(finding))[1])
+    assert share > 60
+
+
+def test_steering_in_degrees_is_refused_agent_by_agent_however_small_the_values_are(log):
+    def gentle(table):
+        changed = bends(180 / np.pi)(table)
+        return changed.assign(steering=(changed.steering / 16).astype(np.float32))  # below 1
+
+    findings = steering_findings(log, gentle)
+    assert [
+        f"(step 0, agent {agent})" in str(finding) for agent, finding in zip(range(100, 104), findings, strict=True)
+    ]
+    assert all("is in another unit" in str(finding) and finding.count == 60 for finding in findings)
+
+
 def test_one_bad_agent_among_many_is_found(tmp_path):
     write_drives(tmp_path / "log", 1, cars=24)
     spoil(tmp_path / "log/drive-000", STATES, of_agent(117, speed=lambda old: old * 3.6))
@@ -195,6 +248,8 @@ def shifted_lanes(x, y):
     def change(chart):
         for lane in chart["lanes"]:
             lane["centre"] = [[px + x, py + y] for px, py in lane["centre"]]
+        for light in chart["lights"]:
+            light["stop_line"] = [[px + x, py + y] for px, py in light["stop_line"]]
 
     return change
 
@@ -218,6 +273,38 @@ def test_few_agents_near_a_lane_are_a_warning_with_the_share(tmp_path):
     assert finding.warning
     assert "% of all rows" in str(finding)
     assert import_drives(tmp_path / "log", tmp_path / "out").drives
+
+
+def shifted_lines(count, x=300):
+    """Move the first stop lines away."""
+
+    def change(chart):
+        for light in chart["lights"][:count]:
+            light["stop_line"] = [[px + x, py] for px, py in light["stop_line"]]
+
+    return change
+
+
+def test_a_stop_line_far_from_its_lane_is_a_warning_and_all_of_them_an_error(log):
+    spoil(log / "drive-001", CHART, shifted_lines(1))
+    (finding,) = check_drives(log)
+    assert finding.warning
+    assert "(light 0)" in str(finding)
+    assert "1 of 4 lights (25%)" in str(finding)
+    assert "4 of 4 lights (100%)" in refusal(log, CHART, shifted_lines(4))
+
+
+def test_a_stop_line_beside_another_lane_than_it_names_is_a_warning(log):
+    def change(chart):
+        lane = chart["lanes"][0]
+        chart["lanes"].append(lane | {"id": 99, "centre": [[x + 90, y + 90] for x, y in lane["centre"]]})
+        chart["lights"][0]["lane"] = 99
+
+    spoil(log / "drive-001", CHART, change)
+    (finding,) = check_drives(log)
+    assert "is not near its lane 99" in str(finding)
+    spoil(log / "drive-001", CHART, lambda chart: chart["lights"][0].update(lane=None))
+    assert list(check_drives(log)) == []
 
 
 def test_routes_elsewhere_are_refused(log):

@@ -270,7 +270,8 @@ def committed(tracker):
 
 def test_publish_builds_from_the_tracker_alone_and_logs_what_it_made(tracker, committed, tmp_path):
     record, run = committed
-    pdf = build.publish(tracker, "pair", None, tmp_path)
+    pdf, code = build.publish(tracker, "pair", None, tmp_path)
+    assert code == 0
     assert pdf.read_bytes().startswith(b"%PDF-")
     numbers = json.loads((tmp_path / "pair/report.json").read_bytes())
     assert numbers | {"figures": []} == json.loads(summarise(record).json())

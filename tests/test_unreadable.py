@@ -8,6 +8,7 @@ import pytest
 
 from study.config.grid import Grid
 from study.errors import BadInputError
+from study.report.__main__ import main
 from study.report.build import complete_cells, publish
 from study.report.markdown import markdown
 from study.report.model import read_report
@@ -67,7 +68,7 @@ def test_a_sweep_to_compare_with_that_cannot_be_read_is_named_and_the_report_is_
     tracker, varied, _ = store
     assert set(complete_cells(tracker.reader, "pair", None).variants) == {"frames.split"}
     shutil.rmtree(artifacts(tracker, varied))
-    publish(tracker, "pair", None, tmp_path)
+    assert publish(tracker, "pair", None, tmp_path)[1] == 0  # nothing of the sweep itself is lost
     report = read_report(tmp_path / "pair")
     assert [varied in line for line in report.unread] == [True]
     assert varied in capsys.readouterr().err
@@ -135,6 +136,22 @@ def test_a_cell_whose_result_is_gone_is_named_and_the_others_are_reported(store)
     assert len(report.scores) == 1
 
 
+@pytest.mark.parametrize("words", [["pair"], ["pair", "--format", "md"], ["compare", "pair", "pair"]])
+def test_the_exit_code_is_1_when_a_finished_result_cannot_be_read_and_its_cell_is_named(
+    store, words, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    tracker, _, _ = store
+    uri = tracker.experiment.uri
+    key, gone = next(iter(tracker.reader.read_sweep("pair").planned.items()))
+    cell_run = tracker.reader.finished([key])[key]
+    assert main([*words, "--tracking", uri]) == 0
+    assert "left out" not in capsys.readouterr().err
+    shutil.rmtree(artifacts(tracker, cell_run))
+    assert main([*words, "--tracking", uri]) == 1
+    assert f"left out of the report: {gone.label}: cell run {cell_run}" in capsys.readouterr().err
+
+
 def test_a_sweep_whose_plan_is_removed_meanwhile_can_be_closed(store):
     tracker, varied, _ = store
     shutil.rmtree(artifacts(tracker, varied))
@@ -150,6 +167,6 @@ def test_a_sweep_of_which_every_cell_has_failed_has_a_report_with_the_reasons(st
         attempt = tracker.start_cell(run, cell, key, record.settings, 3)
         tracker.fail(attempt, "the loss of epoch 3 is nan", permanent=True)
     tracker.close_sweep(run, "FAILED")
-    assert publish(tracker, "doomed", None, tmp_path).read_bytes().startswith(b"%PDF")
+    assert publish(tracker, "doomed", None, tmp_path)[0].read_bytes().startswith(b"%PDF")
     failed = read_report(tmp_path / "doomed").sweep.failed
     assert [failure.reason for failure in failed] == ["the loss of epoch 3 is nan"] * 2

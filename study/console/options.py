@@ -110,10 +110,12 @@ def invoke(
     args: Sequence[str],
     program: str,
     commands: Mapping[str, click.Command] = MappingProxyType({}),
+    hint: str = "",
 ) -> int:
     """Run the command that the first word names, else `default`, and return its exit code.
 
-    The command's context holds the command line as its object. Raises BadInputError for words that it does not take.
+    The command's context holds the command line as its object. Raises BadInputError for words that it does not take;
+    of an option it says which of the commands take it, or else gives the hint.
     """
     command, words, path = default, list(args), f"python -m {program}"
     if words and words[0] in commands:
@@ -123,9 +125,30 @@ def invoke(
             return int(command.invoke(context))
     except click.exceptions.Exit as end:  # after --help
         return end.exit_code
+    except click.NoSuchOption as error:
+        path = error.ctx.command_path if error.ctx else path
+        named = {f"python -m {program}": default} | {f"python -m {program} {name}": commands[name] for name in commands}
+        step = _takers(error.option_name, named) or hint
+        raise BadInputError(
+            "; ".join(filter(None, [error.format_message().rstrip("."), step, f"see {path} --help"]))
+        ) from None
     except click.UsageError as error:
         path = error.ctx.command_path if error.ctx else path
         raise BadInputError(f"{error.format_message().rstrip('.')}; see {path} --help") from None
+
+
+def _takers(option: str, commands: Mapping[str, click.Command]) -> str:
+    """Return in words which commands show this option in their help; empty when none does."""
+    single: dict[str, click.Command] = {}
+    for path, command in commands.items():
+        groups = command.commands if isinstance(command, click.Group) else {"": command}
+        single |= {f"{path} {name}".strip(): each for name, each in groups.items()}
+    names = [
+        path
+        for path, command in single.items()
+        if any(option in each.opts and not getattr(each, "hidden", False) for each in command.params)
+    ]
+    return f"it goes with {', '.join(names)}: leave it out here" if names else ""
 
 
 def _spare_cache() -> None:

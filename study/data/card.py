@@ -7,6 +7,7 @@ take long at the paper's scale are taken from a random part of the frames, with 
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -66,14 +67,19 @@ def make_card(store: FrameStore, drives: Sequence[Path]) -> dict[str, Any]:
 
 def write_card(store: FrameStore, drives: Sequence[Path], folder: Path) -> tuple[Path, ...]:
     """Write the card of the store in `folder`, atomically, and return its files."""
-    from study.figures.data_card import data_card  # noqa: PLC0415 - matplotlib, which a card that exists does not need
+    from study.figures.data_card import data_card, headline  # noqa: PLC0415 - matplotlib, which one needs that is new
+    from study.figures.fonts import fonts_for, lettering  # noqa: PLC0415 - as above
     from study.figures.style import write  # noqa: PLC0415 - as above
 
     card = make_card(store, drives)
+    fonts = fonts_for(headline(card))
+    if fonts.warning:
+        print(f"warning: {fonts.warning}", file=sys.stderr)
     with atomic_folder(folder / "card") as draft:
         (draft / "card.json").write_text(json.dumps(card, indent=1, allow_nan=False) + "\n", encoding="utf-8")
         (draft / "card.txt").write_text(card_text(card), encoding="utf-8")
-        write(data_card(card), draft / "card.png")
+        with lettering(fonts):
+            write(data_card(card), draft / "card.png")
     return tuple(folder / "card" / name for name in FILES)
 
 

@@ -25,6 +25,13 @@ SPIN = 1.5  # largest turn between two steps [rad]
 ASKEW, ACROSS = 0.4, 1.0  # between heading and motion: too much for a quarter of the moments, and for any [rad]
 MOVED = 1.5  # shortest way that shows a direction [m]
 APART = 0.3  # centres of two vehicles are never as near [m]
+BEND = 0.05  # turn from which the unit of steering shows [rad/s]
+FEW_BENDS = 30  # of an agent, from which its unit is told
+FOLLOWS = 0.9  # least correlation of steering with the path's bends, from which its unit is told
+GAIN = 0.2, 2.0  # of an agent's steering over what its path needs: outside, its unit is another one
+# The axles of cars are half to two thirds of their length apart, and all of it in simulators that know no more. As
+# radians, taken for shares of 1.22 rad, the same angles seem 1.22 times as large.
+SHARES, RADIANS = ((0.5, 0.69), (0.9, 1.1)), ((0.69, 0.82), (1.1, 1.35))
 TURNING = 0.02, 0.05  # curvature [1/m] of a turn that shows the sign of steering, and least wheel angle [rad]
 FEW = 10  # moments from which a convention is told
 
@@ -38,10 +45,16 @@ def wrap(angle: NDArray[Any]) -> NDArray[Any]:
     return wrapped
 
 
+def _within(values: Floats, spans: Sequence[tuple[float, float]]) -> Bools:
+    """Return which values lie in one of the spans."""
+    inside: Bools = np.logical_or.reduce([(low <= values) & (values < high) for low, high in spans])
+    return inside
+
+
 def motion_faults(rows: Rows, rate: float, agents: Sequence[Agent], findings: Findings) -> Bools:
     """Return which rows belong to impossible motion; `findings` get them, agent by agent.
 
-    Steering that points the other way is made unknown in `rows`, which stay.
+    Steering that points the other way, or is in another unit, is made unknown in `rows`, which stay.
     """
     order = np.lexsort((rows["step"], rows["agent"]))
     names = ("step", "agent", "number", "x", "y", "heading", "speed", "steering")
@@ -50,6 +63,7 @@ def motion_faults(rows: Rows, rate: float, agents: Sequence[Agent], findings: Fi
     tracks.find_speeds()
     tracks.find_headings()
     tracks.find_steering()
+    tracks.find_steering_unit(np.array([agent.length for agent in agents])[rows["agent"][order]])
     bad = np.zeros(len(order), bool)
     bad[order] = tracks.bad
     if tracks.contrary.any():
@@ -67,7 +81,7 @@ class _Tracks:
         self.agents = len(agents)
         self.ids = np.array([agent.id for agent in agents], np.int64)[rows["agent"]]
         self.bad = np.zeros(len(self.ids), bool)
-        self.contrary = self.bad.copy()  # rows whose steering points the other way
+        self.contrary = self.bad.copy()  # rows whose steering points the other way, or is in another unit
         self.stretch = np.zeros(len(self.ids), np.int64)  # number of the unbroken stretch that a row belongs to
         step, agent = rows["step"], rows["agent"]
         self.joined = (np.diff(agent) == 0) & (np.diff(step) == 1)  # row k + 1 is the step after row k
@@ -227,6 +241,44 @@ class _Tracks:
         rule = "points away from the turns that this agent makes (at {share:.0%} of them); left is positive"
         known = np.isfinite(rows["steering"])
         self.contrary = self.add(enough & (share > 0.9) & known, "steering", rule, share=share)
+
+    def find_steering_unit(self, length: Floats) -> None:
+        """Hold steering against the wheel angle that its path needs, for axles the agent's `length` apart [m]."""
+        rows, half = self.rows, max(1, round(self.rate / 4))
+        if "steering" not in rows:
+            return
+        start = self.window(2 * half)
+        middle = start + half
+        heading = rows["heading"].astype(np.float64)
+        turned = wrap(heading[start + 2 * half] - heading[start]) * self.rate / (2 * half)
+        speed = rows["speed"][middle].astype(np.float64)
+        value = rows["steering"][middle].astype(np.float64)
+        slip = np.arcsin(np.clip(turned * length[middle] / (2 * np.maximum(speed, 1)), -0.9, 0.9))
+        needs = np.arctan(2 * np.tan(slip))  # as in `study.episode.adapt`
+        shows = (speed > 2) & (np.abs(turned) > BEND) & np.isfinite(value) & ~self.contrary[middle]
+        middle, value, needs = middle[shows], value[shows] * DynamicsSettings().steering_unit, needs[shows]
+        ratio, agent = value / needs, rows["agent"][middle]
+        gains = np.full(self.agents, np.nan)
+        for number in np.flatnonzero(np.bincount(agent, minlength=self.agents) >= FEW_BENDS):
+            own = agent == number
+            if np.std(value[own]) > 0 and np.corrcoef(value[own], needs[own])[0, 1] > FOLLOWS:
+                gains[number] = np.median(ratio[own])
+        gain = gains[rows["agent"]]
+        rule = (
+            "is in another unit: this agent's values are {gain:.3g} times the wheel angles that its path needs; 1 is "
+            "1.22 rad of the front wheels (a degree is 0.0143)"
+        )
+        known = np.isfinite(rows["steering"])
+        self.contrary |= self.add(((gain < GAIN[0]) | (gain > GAIN[1])) & known, "steering", rule, gain=gain)
+        radians = _within(gains, RADIANS)
+        judged = radians | _within(gains, SHARES)
+        if judged.any() and radians.sum() > judged.sum() / 2:
+            share = _within(ratio[judged[agent]], RADIANS).mean()
+            self.findings.warn(
+                "states.parquet",
+                f", field 'steering': {share:.0%} of the values in bends, and {radians.sum()} of {judged.sum()} "
+                "agents, look like wheel angles in radians; 1 is 1.22 rad: divide by 1.22, if they are",
+            )
 
     def _first_of_agent(self, wrong: Bools, values: Floats) -> Floats:
         """Return, for each row, the value at the first wrong row of its agent."""

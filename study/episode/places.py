@@ -1,4 +1,4 @@
-"""Whether agents and lanes lie in one frame of reference: vehicles drive on lanes, or near them."""
+"""Whether agents, lanes and lights lie in one frame of reference: vehicles drive on lanes and stop lines cross them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from study.episode.findings import Findings
 from study.episode.recording import Recording
 from study.episode.rows import Rows
-from study.episode.schema import Agent, Lane
+from study.episode.schema import Agent, Lane, Light
 
 CELL = 10.0  # [m] a vehicle in a lane's cell, or in one beside it, is near the lane
 FARTHEST = 1 << 15  # cell from the origin: 300 km, far beyond what an Episode may hold
@@ -21,10 +21,14 @@ AROUND = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 2)
 
 
 def check_places(recording: Recording, findings: Findings) -> None:
-    """Add an error when no agent is ever near a lane, or near its route; a warning, with the share, when few are."""
+    """Add an error when no agent is ever near a lane, or near its route; a warning, with the share, when few are.
+
+    The same for stop lines, each of which is near a lane: near its own, where it names one.
+    """
     if len(recording.rows["x"]):
         _check_lanes(recording.rows, recording.agents, recording.lanes, findings)
         _check_routes(recording.rows, recording.agents, recording.routes, findings)
+    _check_lights(recording.lights, recording.lanes, findings)
 
 
 def _check_routes(
@@ -78,6 +82,32 @@ def _check_lanes(rows: Rows, agents: Sequence[Agent], lanes: Sequence[Lane], fin
         )
     else:
         findings.warn("states.parquet", f"{place}: do map and agents lie in one frame of reference?")
+
+
+def _check_lights(lights: Sequence[Light], lanes: Sequence[Lane], findings: Findings) -> None:
+    if not (lights and lanes):
+        return
+    around = {
+        lane.id: _key((np.unique(_cells(_dense(lane.centre)), axis=0)[:, None] + AROUND).reshape(-1, 2))
+        for lane in lanes
+    }
+    anywhere = np.unique(np.concatenate(list(around.values())))
+    away = []
+    for light in lights:
+        place = _key(_cells(light.stop_line.mean(axis=0, keepdims=True)))
+        if not np.isin(place, anywhere if light.lane is None else around[light.lane]).any():
+            away.append(light)
+    if not away:
+        return
+    first = away[0]
+    x, y = first.stop_line.mean(axis=0)
+    lane = "any lane" if first.lane is None else f"its lane {first.lane}"
+    text = (
+        f", field 'lights[*].stop_line' (light {first.id}): its middle ({x:.6g}, {y:.6g}) is not near {lane}, as those "
+        f"of {len(away)} of {len(lights)} lights ({len(away) / len(lights):.0%}): bring lights and lanes into one "
+        "frame of reference, name the lane that each light governs, or leave such lights out"
+    )
+    (findings.add if len(away) == len(lights) else findings.warn)("map.json", text)
 
 
 def _cells(points: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -15,6 +15,7 @@ from study.figures.style import STYLE, new_figure
 
 SET_COLOUR = {"encoder": "#0072B2", "policy": "#D55E00"}
 SPLIT_COLOUR = {"episode": "#009E73", "frame": "#CC79A7"}
+WRITERS = 3  # that are named at most
 SPLIT_LINE = {"episode": "-", "frame": "--"}
 
 
@@ -39,19 +40,24 @@ def data_card(card: Mapping[str, Any]) -> Figure:
         twins = sets[name]["twins"]
         _distances(panel, twins, f"({letter}) Twins, {name} set, n = {twins['frame']['asked']:,}")
     panels[4].set_ylabel("test frames with a nearer one [%]")
-    figure.suptitle(_headline(card), x=0.01, ha="left", fontsize=7.5)
+    figure.suptitle(headline(card), x=0.01, ha="left", fontsize=7.5, parse_math=False)
     return figure
 
 
-def _headline(card: Mapping[str, Any]) -> str:
+def headline(card: Mapping[str, Any]) -> str:
+    """Return the title: what the frames were made from, by whom, and how much of it there is."""
     drives = card["drives"]
     frames = " + ".join(f"{entry['frames']:,} {name}" for name, entry in card["sets"].items())
     first = f"{frames} frames of {drives['used']} drives, split by {card['split']} (store {card['key']})"
     if "towns" not in drives:
         return first
+    writers = [" ".join(name.split()) for name in drives["writers"][:WRITERS]] + ["..."] * (
+        len(drives["writers"]) > WRITERS
+    )
     return (
         f"{first}\n{drives['towns']} towns, {drives['hours']:.2f} h of traffic, {drives['vehicles']:,} vehicles, "
-        f"{drives['vehicle_hours']:.1f} vehicle hours, {drives['vehicle_km']:,.0f} vehicle km"
+        f"{drives['vehicle_hours']:.1f} vehicle hours, {drives['vehicle_km']:,.0f} vehicle km\n"
+        f"written by {', '.join(writers)}"
     )
 
 

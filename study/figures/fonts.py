@@ -27,7 +27,7 @@ class Fonts:
         """Return what to tell readers, or an empty text."""
         if not self.missing:
             return ""
-        return f"no font on this machine has {', '.join(self.missing)}; install one, and write the report again"
+        return f"no font on this machine has {', '.join(self.missing)}; install one, and give the command again"
 
 
 def fonts_for(text: str) -> Fonts:

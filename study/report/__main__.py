@@ -17,6 +17,11 @@ import click
 from study.config.workspace import HERE
 from study.console.options import invoke, run, tracking_option
 
+HINT = (
+    "settings and options of a run go with python -m study.sweep: a report takes the sweep's name and, with --profile, "
+    "its profile"
+)
+
 
 @click.command(epilog="python -m study.report compare A B sets two sweeps side by side; see its --help")
 @click.argument("name", metavar="SWEEP")
@@ -27,15 +32,17 @@ from study.console.options import invoke, run, tracking_option
 def report(name: str, profile: str | None, kind: str, out: Path, tracking: str) -> int:
     """Write the report of SWEEP from what MLflow holds: PDF, figures, numbers and the tidy table.
 
-    With --format md, print the report without figures as Markdown.
+    With --format md, print the report without figures as Markdown. Exit code 1: the result of a finished cell is lost.
     """
     reader = resolve_name("study.tracking.reader:Reader").existing(tracking)
     if kind == "md":
-        print(resolve_name("study.report.build:report_as_markdown")(reader, name, profile), end="")
+        text, code = resolve_name("study.report.build:report_as_markdown")(reader, name, profile)
+        print(text, end="")
     else:
         tracker = resolve_name("study.tracking.tracker:Tracker")(tracking)  # the report becomes part of the run
-        print(resolve_name("study.report.build:publish")(tracker, name, profile, out))
-    return 0
+        pdf, code = resolve_name("study.report.build:publish")(tracker, name, profile, out)
+        print(pdf)
+    return int(code)
 
 
 @click.command
@@ -54,13 +61,14 @@ def compare(first: str, second: str, figure: Path | None, tracking: str) -> int:
 
     A and B: each a report.json, a folder that holds one, or NAME[:PROFILE][@URI] of a sweep in MLflow.
     """
-    print(resolve_name("study.report.build:side_by_side")(first, second, tracking, figure), end="")
-    return 0
+    text, code = resolve_name("study.report.build:side_by_side")(first, second, tracking, figure)
+    print(text, end="")
+    return int(code)
 
 
 def main(args: Sequence[str]) -> int:
     """Run the command and return its exit code."""
-    return invoke(report, args, "study.report", {"compare": compare})
+    return invoke(report, args, "study.report", {"compare": compare}, HINT)
 
 
 if __name__ == "__main__":

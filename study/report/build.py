@@ -13,7 +13,7 @@ import typst
 
 from study.atomic import write_atomic
 from study.config.workspace import HERE
-from study.errors import BadInputError, masked
+from study.errors import EXIT_FAILED, BadInputError, masked
 from study.figures.fonts import fonts_for, lettering
 from study.figures.style import METADATA, save, write
 from study.report.comparison import compare
@@ -69,43 +69,55 @@ def typeset(
     return pdf
 
 
-def publish(tracker: Tracker, name: str, profile: str | None, folder: Path) -> Path:
-    """Build the report from the tracker alone, and add it to the sweep's run. Returns the PDF's path."""
+def publish(tracker: Tracker, name: str, profile: str | None, folder: Path) -> tuple[Path, int]:
+    """Build the report from the tracker alone, and add it to the sweep's run. Returns the PDF's path and exit code."""
     record = complete_cells(tracker.reader, name, profile)
     pdf, files = build_report(record, folder), folder / name
     tracker.log_files(record.run_id, [pdf, files / "report.json", files / "curves.parquet"], "report")
     tracker.log_files(record.run_id, sorted((files / "figures").glob("*")), "figures")
-    return pdf
+    return pdf, exit_code(record)
+
+
+def exit_code(record: SweepRecord) -> int:
+    """Return 1 when the result of a finished cell is lost, which `complete_cells` has named, else 0."""
+    return EXIT_FAILED if record.lost else 0
 
 
 def complete_cells(reader: Reader, name: str, profile: str | None) -> SweepRecord:
     """Return a sweep with those that vary one of its confounds; say on stderr what cannot be read."""
     record = with_variants(reader, reader.read_sweep(name, profile))
-    for line in record.unread:
-        print(f"left out of the report: {line}", file=sys.stderr)
+    _say_unread(record)
     return record
 
 
-def report_as_markdown(reader: Reader, name: str, profile: str | None) -> str:
-    """Return the report of a sweep as Markdown, without figures."""
-    return markdown(document(summarise(complete_cells(reader, name, profile))))
+def _say_unread(record: SweepRecord) -> None:
+    for line in record.unread:
+        print(f"left out of the report: {line}", file=sys.stderr)
 
 
-def side_by_side(first: str, second: str, tracking: str, figure: Path | None = None) -> str:
-    """Return two sweeps' comparison as Markdown, each named by a path or as NAME[:PROFILE][@URI].
+def report_as_markdown(reader: Reader, name: str, profile: str | None) -> tuple[str, int]:
+    """Return the report of a sweep as Markdown, without figures, and the exit code."""
+    record = complete_cells(reader, name, profile)
+    return markdown(document(summarise(record))), exit_code(record)
+
+
+def side_by_side(first: str, second: str, tracking: str, figure: Path | None = None) -> tuple[str, int]:
+    """Return two sweeps' comparison as Markdown, and the exit code; each is a path or NAME[:PROFILE][@URI].
 
     Both are drawn into `figure` first, where there is one. Raises BadInputError for what cannot be read or written.
     """
     if figure:
         _check_figure(figure)
-    sides, names = (_report(first, tracking), _report(second, tracking)), (masked(first), masked(second))
+    read, names = (_report(first, tracking), _report(second, tracking)), (masked(first), masked(second))
+    sides = (read[0][0], read[1][0])
     if figure:
         try:
             with lettering(fonts_for("".join([*names, *(side.json().decode() for side in sides)]))):
                 write(draw_sweeps(*sides, names), figure)
         except OSError as error:
             raise BadInputError(f"cannot write {figure}: {error.strerror}; name another file") from error
-    return markdown(compare(*sides, names, Path(os.path.relpath(figure)).as_posix() if figure else ""))
+    text = markdown(compare(*sides, names, Path(os.path.relpath(figure)).as_posix() if figure else ""))
+    return text, max(code for _, code in read)
 
 
 def _check_figure(file: Path) -> None:
@@ -120,9 +132,12 @@ def _check_figure(file: Path) -> None:
         raise BadInputError(f"--figure {file} is a folder; name a file in it")
 
 
-def _report(source: str, tracking: str) -> Report:
+def _report(source: str, tracking: str) -> tuple[Report, int]:
+    """Return a report and the exit code."""
     sweep, _, uri = source.partition("@")
     if Path(source).exists() or "/" in sweep or sweep.endswith(".json"):
-        return read_report(Path(source))
+        return read_report(Path(source)), 0
     name, _, profile = sweep.partition(":")
-    return summarise(Reader.existing(uri or tracking).read_sweep(name, profile or None))
+    record = Reader.existing(uri or tracking).read_sweep(name, profile or None)
+    _say_unread(record)
+    return summarise(record), exit_code(record)

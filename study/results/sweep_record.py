@@ -20,7 +20,7 @@ class SweepRecord:
 
     `provenance`: commit, uncommitted diff, versions, machine; `data`: the frame store's manifest; `variants`: sweeps
     that differ in one setting only, by its name; `run_id`: of its run in MLflow; `unread`: what of all this could not
-    be read and is left out, and why.
+    be read and is left out, and why; `lost`: which of the cells are finished and cannot be read.
     """
 
     grid: Grid
@@ -34,6 +34,7 @@ class SweepRecord:
     variants: dict[str, SweepRecord] = field(default_factory=dict)
     run_id: str = ""
     unread: tuple[str, ...] = ()
+    lost: tuple[str, ...] = ()
 
     @property
     def complete(self) -> bool:

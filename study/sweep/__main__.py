@@ -69,11 +69,12 @@ def status(*, plan: Plan, tracking: str, as_json: bool) -> int:
 @options.plan_options()
 @click.option("--cell", metavar="CELL", help="label or key of a finished cell, as --dry-run shows them [any]")
 @click.option("--seed", type=int, metavar="N", help="draws the cell [any]")
+@options.workers
 @tracking_option()
-def verify(*, plan: Plan, cell: str | None, seed: int | None, tracking: str) -> int:
+def verify(*, plan: Plan, cell: str | None, seed: int | None, workers: int | None, tracking: str) -> int:
     """Compute a finished cell of the sweep NAME again; compare curves, weights and predictions byte for byte."""
     draw = random.randrange(10**6) if seed is None else seed  # noqa: S311 - no secret
-    return int(resolve_name("study.sweep.verify:verify")(plan, tracking, cell, draw))
+    return int(resolve_name("study.sweep.verify:verify")(plan, tracking, cell, draw, workers))
 
 
 @click.command

@@ -18,7 +18,7 @@ from study.tracking.tracker import Tracker
 
 
 def import_folder(plan: Plan, folder: Path, tracking: str, *, wait: bool, report: bool) -> int:
-    """Commit what was trained elsewhere; then write the report, or say which cells are missing. Returns exit code 0."""
+    """Commit what was trained elsewhere, then write the report or name the missing cells; returns the exit code."""
     keys = planned_results(plan, folder)
     with hold_store(plan, tracking, wait=wait):
         tracker = Tracker(tracking)
@@ -28,7 +28,7 @@ def import_folder(plan: Plan, folder: Path, tracking: str, *, wait: bool, report
         if missing:
             _say(f"Import them, too, or train them here: {plan.command}")
         elif report:
-            write_report(plan, tracker)
+            return write_report(plan, tracker)
     return 0
 
 

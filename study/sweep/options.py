@@ -80,6 +80,9 @@ threads = click.option(
     metavar="N",
     help="threads of each task, for a lone large encoder; the last digits of results depend on it [1]",
 )
+workers = click.option(
+    "--workers", type=click.IntRange(min=1), metavar="N", help="processes on this machine, one task each [cores]"
+)
 wait = click.option("--wait", is_flag=True, help="wait while another sweep runs on this tracking store")
 
 
@@ -88,12 +91,7 @@ def run_options() -> Decorator:
     return bundled(
         "run_options",
         RunOptions,
-        click.option(
-            "--workers",
-            type=click.IntRange(min=1),
-            metavar="N",
-            help="processes on this machine, one task each [cores]",
-        ),
+        workers,
         click.option(
             "--cluster",
             metavar="WHERE",

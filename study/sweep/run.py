@@ -42,14 +42,14 @@ def execute(plan: Plan, options: RunOptions, command: str, *, report: bool) -> i
     warn_of_unknown_origin(origin)
     with hold_store(plan, options.tracking, wait=options.wait):
         tracker = Tracker(options.tracking)
-        failed = run_cells(plan, options, tracker, origin)
+        failed, code = run_cells(plan, options, tracker, origin), 0
         try:
             if report:
                 print("writing the report", file=sys.stderr)
-                write_report(plan, tracker)
+                code = write_report(plan, tracker)
         finally:  # whatever becomes of the report
             _say_failed(plan, failed, command)
-    return EXIT_FAILED if failed else 0
+    return EXIT_FAILED if failed else code
 
 
 def _say_failed(plan: Plan, failed: Mapping[str, str], command: str) -> None:
@@ -59,9 +59,11 @@ def _say_failed(plan: Plan, failed: Mapping[str, str], command: str) -> None:
         print(f"Once the cause is gone: {command.removesuffix(' --retry-failed')} --retry-failed", file=sys.stderr)
 
 
-def write_report(plan: Plan, tracker: Tracker) -> None:
-    """Write the report of a plan's sweep, and print where it is."""
-    print(f"report: {publish(tracker, plan.grid.name, plan.profile, plan.workspace.reports)}", file=sys.stderr)
+def write_report(plan: Plan, tracker: Tracker) -> int:
+    """Write the report of a plan's sweep, print where it is, and return the exit code."""
+    pdf, code = publish(tracker, plan.grid.name, plan.profile, plan.workspace.reports)
+    print(f"report: {pdf}", file=sys.stderr)
+    return code
 
 
 def run_cells(plan: Plan, options: RunOptions, tracker: Tracker, origin: dict[str, Any]) -> dict[str, str]:

@@ -137,8 +137,11 @@ def choose(finished: Mapping[str, Cell], wanted: str | None, seed: int) -> str:
     raise one_of("finished cell", wanted, [cell.label for cell in finished.values()])
 
 
-def compute_again(plan: Plan, recorded: CellResult, display: Display) -> CellResult:
-    """Compute the cell of a result again, as its facts say: threads, device, precision. Only frames are kept."""
+def compute_again(plan: Plan, recorded: CellResult, display: Display, workers: int | None = None) -> CellResult:
+    """Compute the cell of a result again, as its facts say: threads, device, precision. Only frames are kept.
+
+    `workers`: processes, by default one for each core; the result does not depend on it.
+    """
     values = {name: value for name, value in recorded.settings.items() if name in StudySettings.model_fields}
     values["encoder"] = values["encoder"] | {"precision": recorded.facts["precision"]}  # "auto" is another elsewhere
     settings = StudySettings.model_validate(values)
@@ -148,7 +151,7 @@ def compute_again(plan: Plan, recorded: CellResult, display: Display) -> CellRes
     alike = [gpu for gpu in gpus if torch.cuda.get_device_name(int(gpu)) == name]
     use = [] if name.lower() == "cpu" else (alike or gpus)[:1]
     with (
-        local_engine(cores(), plan.workspace.tmp, use) as engine,
+        local_engine(workers or cores(), plan.workspace.tmp, use) as engine,
         tempfile.TemporaryDirectory(prefix=".verify-", dir=plan.workspace.data) as scratch,
     ):
         frames = run_flow(data_flow(plan.settings, plan.workspace.data, plan.imported), engine, display.data)
@@ -172,7 +175,7 @@ def compute_again(plan: Plan, recorded: CellResult, display: Display) -> CellRes
         return CellResult.load(again.save(Path(scratch) / "result"))  # as the recorded one was
 
 
-def verify(plan: Plan, tracking: str, wanted: str | None, seed: int) -> int:
+def verify(plan: Plan, tracking: str, wanted: str | None, seed: int, workers: int | None = None) -> int:
     """Compute a finished cell again, print how it compares, and return the exit code."""
     reader = look_up(tracking)
     runs = reader.finished(list(plan.cells)) if reader else {}
@@ -183,7 +186,7 @@ def verify(plan: Plan, tracking: str, wanted: str | None, seed: int) -> int:
     recorded = reader.load_result(runs[key])
     plan.workspace.data.mkdir(exist_ok=True)
     with plan_display(plan, [key]) as display:
-        again = compute_again(plan, recorded, display)
+        again = compute_again(plan, recorded, display, workers)
     return report(recorded, again, plan.grid.rules.allowance([recorded.cell.heads] * 2))
 
 

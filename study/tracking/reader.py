@@ -165,14 +165,26 @@ class Reader:
         reasons = {run.data.tags.get("cell_key"): reason_of(run.data.tags) for run in failures}
         failed = {key: reason for key, reason in reasons.items() if key in planned and key not in done}
         results: dict[str, CellResult] = {}
+        lost: list[str] = []
         for key, run in done.items():
             try:
                 results[key] = self.load_result(run)
             except UnreadableError as error:
                 failed[key] = f"its result cannot be read: {error}"
                 unread.append(f"{planned[key].label}: {error}")
+                lost.append(key)
         return SweepRecord(
-            grid, profile, settings, planned, results, failed, provenance, data, run_id=run_id, unread=tuple(unread)
+            grid,
+            profile,
+            settings,
+            planned,
+            results,
+            failed,
+            provenance,
+            data,
+            run_id=run_id,
+            unread=tuple(unread),
+            lost=tuple(lost),
         )
 
     def _missing(self, run_id: str) -> list[str]:
