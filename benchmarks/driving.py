@@ -17,8 +17,9 @@ import torch
 from study.compute.provenance import provenance
 from study.config.paper import IMAGE
 from study.config.settings import SPEEDS, StudySettings
-from study.driving.actors import Observations, PolicyActor, image_encoder
+from study.driving.actors import PolicyActor, image_encoder
 from study.driving.drives import held_out_drives
+from study.driving.observations import Observations
 from study.driving.ride import Ride
 from study.encoder.networks import untrained_encoder
 from study.policy.latents import normalisation

@@ -10,14 +10,12 @@ from study.analysis.comfort import comfortable
 from study.analysis.proportions import wilson_interval
 from study.config.paper import ACCELERATIONS, STEERING_CROP
 from study.config.settings import BirdviewSettings, RecordingSettings, StudySettings, TownSettings
-from study.data.birdview import Renderer
+from study.data.birdview import Image, Renderer
 from study.data.prepare import POLICY_SEED
 from study.driving.actors import (
     Expert,
     ExportedActor,
     FunctionActor,
-    Image,
-    Observation,
     PolicyActor,
     image_encoder,
 )
@@ -25,6 +23,7 @@ from study.driving.driver import Driver
 from study.driving.drives import Drive, held_out_drives
 from study.driving.faults import at_fault, collision_kind
 from study.driving.metrics import DriveScores, collisions_per_km, progress, score_drive
+from study.driving.observations import Observation
 from study.driving.ride import BLOCKED
 from study.driving.rollout import ActorError, rollout
 from study.encoder.networks import untrained_encoder

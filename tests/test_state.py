@@ -10,7 +10,7 @@ from study.config.keys import FORMAT_VERSIONS
 from study.config.settings import BirdviewSettings, FramesSettings
 from study.data.past_speeds import past_speeds
 from study.data.selection import candidates
-from study.data.true_state import true_state
+from study.data.true_state import scaled_state, state_scale, stored_state
 from study.episode.files import read_episode
 from study.episode.head import episode_digest
 from study.errors import BadInputError
@@ -38,6 +38,11 @@ def labels(folder):
 @pytest.fixture(scope="module")
 def sources(folder):
     return [{"name": path.name, "digest": episode_digest(path)} for path in sorted(folder.iterdir())]
+
+
+def true_state(labels, sources, folder):
+    columns = stored_state(labels, sources, folder)
+    return scaled_state(columns, state_scale(columns, labels["train"].to_numpy()))
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from study.baselines.inputs import BaselineInputs, Z
+from study.baselines.inputs import BaselineInputs, Z, learned
 from study.compute.device import check_device, keep_memory
 from study.compute.trainer import trainer
 from study.config.paper import ACCELERATION_HIDDEN, ACCELERATIONS, DROPOUT, LATENT, STEERING_HIDDEN
@@ -23,21 +23,31 @@ from study.encoder.inputs import to_float
 from study.encoder.latents import encode
 from study.encoder.networks import initialise, seeded_generator, untrained_encoder
 from study.errors import TrainingDivergedError
+from study.products import Arrays
 from study.randomness import rng
 from study.stages import SUPERVISED_EPOCHS
 
 
 def supervised_latents(inputs: BaselineInputs) -> Z:
     """Return the latents of the trained network. Raises TrainingDivergedError for a loss that is not finite."""
-    device, images = check_device(inputs.device), inputs.store.policy.images
+    images = inputs.store.policy.images
+    return encode(supervised_weights(inputs), images, np.arange(len(images)), device=inputs.device)
+
+
+def supervised_weights(inputs: BaselineInputs) -> Arrays:
+    """Return the weights of the trained encoder."""
+    return learned(inputs, lambda: _train(inputs))
+
+
+def _train(inputs: BaselineInputs) -> Arrays:
+    device = check_device(inputs.device)
     if device.type == "cpu":
         keep_memory()
     network = _Supervised(inputs)
     load = f"batch {inputs.settings.encoder.batch}"
     with trainer(device, SUPERVISED_EPOCHS, load, "lower --encoder.batch") as lightning_trainer:
         lightning_trainer.fit(network, train_dataloaders=range(network.batches))
-    weights = {name: value.numpy(force=True) for name, value in network.encoder.state_dict().items()}
-    return encode(weights, images, np.arange(len(images)), device=inputs.device)
+    return {name: value.numpy(force=True) for name, value in network.encoder.state_dict().items()}
 
 
 class _Head(nn.Module):

@@ -18,7 +18,7 @@ from study.baselines.inputs import BaselineInputs
 from study.cell.job import CellJob
 from study.compute.device import choose_device, describe_determinism, device_name, peak_bytes
 from study.compute.provenance import provenance
-from study.config.keys import cell_key
+from study.config.keys import baseline_folder, cell_key
 from study.config.modules import load_modules
 from study.config.paper import LATENT
 from study.config.settings import SPEEDS
@@ -86,9 +86,9 @@ def encode_policy_set(job: CellJob, encoder: Product | None, report: Reporter) -
     part = policy.subset(job.settings.policy.share, "frame", job.settings.frames.seed)
     rows = {"train": part, "test": policy.indices("test")}
     if encoder is None:
-        inputs = BaselineInputs(
-            store, job.drives, job.settings, job.cell.encoder_seed, device, partial(report, "progress")
-        )
+        folder = baseline_folder(job.products, job.settings, job.cell, store.key)
+        progress = partial(report, "progress")
+        inputs = BaselineInputs(store, job.drives, job.settings, job.cell.encoder_seed, device, progress, folder)
         assert job.cell.baseline
         given = pkgutil.resolve_name(job.cell.baseline.inputs)(inputs)
         z = {split: given[indices] for split, indices in rows.items()}

@@ -18,7 +18,9 @@ class Baseline:
 
     `word` names it in reports, `about` explains it. `inputs` is the "module:function" that returns what policies see,
     see `study.baselines.inputs`. `trivial`: it has learned nothing from driving, so a latent should beat it. `seeds`:
-    how many of it there are. Colour (`#RRGGBB`) and line style in every figure.
+    how many of it there are. Colour (`#RRGGBB`) and line style in every figure. `driving` is the "module:function" that
+    gives policies the same at the wheel, see `study.driving.baselines`, empty where they cannot drive; without `sees`,
+    no bird view is painted for it.
     """
 
     name: str
@@ -29,6 +31,8 @@ class Baseline:
     line: str = ":"
     trivial: bool = True
     seeds: int = 1
+    driving: str = ""
+    sees: bool = True
 
 
 # In the order of every table: from what knows least to what knows all.
@@ -42,6 +46,7 @@ BASELINES: dict[str, Baseline] = {
             "study.baselines.images:untrained",
             "#999999",
             seeds=3,
+            driving="study.driving.baselines:untrained",
         ),
         Baseline(
             "image-pca",
@@ -49,6 +54,7 @@ BASELINES: dict[str, Baseline] = {
             "the first 64 principal components of the image",
             "study.baselines.images:image_components",
             "#56B4E9",
+            driving="study.driving.baselines:image_components",
         ),
         Baseline(
             "trail-pca",
@@ -56,6 +62,7 @@ BASELINES: dict[str, Baseline] = {
             "the first 64 principal components of the ego's own trail, without map, lights and other vehicles",
             "study.baselines.images:trail_components",
             "#009E73",
+            driving="study.driving.baselines:trail_components",
         ),
         Baseline(
             "last-command",
@@ -63,6 +70,8 @@ BASELINES: dict[str, Baseline] = {
             "the expert's command of 0.1 s ago, and no image",
             "study.baselines.commands:last_command",
             "#CC79A7",
+            driving="study.driving.baselines:last_command",
+            sees=False,
         ),
         Baseline(
             SUPERVISED,
@@ -72,6 +81,7 @@ BASELINES: dict[str, Baseline] = {
             "#8C6D1F",
             line="--",
             trivial=False,
+            driving="study.driving.baselines:supervised",
         ),
         Baseline(
             CEILING,
@@ -80,6 +90,8 @@ BASELINES: dict[str, Baseline] = {
             "study.baselines.commands:true_state",
             "#666666",
             trivial=False,
+            driving="study.driving.baselines:true_state",
+            sees=False,
         ),
     )
 }

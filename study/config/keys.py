@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel
@@ -78,6 +79,11 @@ def encoder_key(settings: StudySettings, cell: Cell, frames: str) -> str:
     if cell.fraction < 1:
         parts |= {"budget": settings.encoder.budget, "unit": settings.frames.unit}
     return content_key("encoder", parts, (frames,), FORMAT_VERSIONS["encoder"])
+
+
+def baseline_folder(products: Path, settings: StudySettings, cell: Cell, frames: str) -> Path:
+    """Return the folder that keeps what a baseline has learned."""
+    return products / f"baseline-{encoder_key(settings, cell, frames)}"
 
 
 def cell_key(settings: StudySettings, cell: Cell, policy_seeds: int, frames: str) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.neighbors import KDTree
@@ -15,19 +17,27 @@ TURNED = 10.0  # a lane in the opposite direction counts as twice this much fart
 Floats = NDArray[np.float64]
 
 
-def speed_limits(episode: Episode, moments: Moments) -> NDArray[np.float32]:
-    """Return the limit [M] [m/s] of the lane nearest to each vehicle in place and direction, NaN if unknown."""
-    limits = np.array([np.nan if lane.speed_limit is None else lane.speed_limit for lane in episode.lanes])
-    if len(np.unique(limits)) < 2:
-        return np.full(len(moments), limits[0] if len(limits) else np.nan, np.float32)
-    lines = [_line(lane) for lane in episode.lanes]
-    owner = np.repeat(np.arange(len(lines)), [len(line) for line in lines])
-    at = tuple(moments.T)
-    heading = episode.heading[at].astype(np.float64)
-    seen = np.stack([episode.x[at], episode.y[at], TURNED * np.cos(heading), TURNED * np.sin(heading)], axis=1)
-    nearest = KDTree(np.concatenate(lines)).query(seen, return_distance=False)[:, 0]
-    here: NDArray[np.float32] = limits[owner[nearest]].astype(np.float32)
-    return here
+class Limits:
+    """The speed limits of a map."""
+
+    def __init__(self, lanes: Sequence[Lane]) -> None:
+        self._limits = np.array([np.nan if lane.speed_limit is None else lane.speed_limit for lane in lanes])
+        self._tree: KDTree | None = None
+        if len(np.unique(self._limits)) > 1:
+            lines = [_line(lane) for lane in lanes]
+            self._owner = np.repeat(np.arange(len(lines)), [len(line) for line in lines])
+            self._tree = KDTree(np.concatenate(lines))
+
+    def of(self, episode: Episode, moments: Moments) -> NDArray[np.float32]:
+        """Return the limit [M] [m/s] of the lane nearest to each vehicle in place and direction, NaN if unknown."""
+        if self._tree is None:
+            return np.full(len(moments), self._limits[0] if len(self._limits) else np.nan, np.float32)
+        at = tuple(moments.T)
+        heading = episode.heading[at].astype(np.float64)
+        seen = np.stack([episode.x[at], episode.y[at], TURNED * np.cos(heading), TURNED * np.sin(heading)], axis=1)
+        nearest = self._tree.query(seen, return_distance=False)[:, 0]
+        here: NDArray[np.float32] = self._limits[self._owner[nearest]].astype(np.float32)
+        return here
 
 
 def _line(lane: Lane) -> Floats:

@@ -9,8 +9,10 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from study.data.birdview import Moments
 from study.episode.files import read_episode
 from study.episode.head import episode_digest
+from study.episode.schema import Episode
 from study.errors import BadInputError
 
 
@@ -34,8 +36,13 @@ def past_speeds(
             )
         episode = read_episode(folder)
         column = {agent.id: place for place, agent in enumerate(episode.agents)}
-        columns = rows["agent"].map(column).to_numpy()[:, None]
-        times = rows["step"].to_numpy()[:, None] - np.asarray(steps)
-        speed = np.where(times < 0, np.nan, episode.speed[np.maximum(times, 0), columns])
-        past[rows.index] = np.where(np.isnan(speed), rows["speed"].to_numpy()[:, None], speed)
+        moments = np.stack([rows["step"].to_numpy(), rows["agent"].map(column).to_numpy()], axis=1)
+        past[rows.index] = speeds_before(episode, moments, steps)
     return past
+
+
+def speeds_before(episode: Episode, moments: Moments, steps: Sequence[int]) -> NDArray[np.float64]:
+    """Return the same of moments [M, 2] of one Episode."""
+    times, agents = moments[:, :1] - np.asarray(steps), moments[:, 1:]
+    speed = np.where(times < 0, np.nan, episode.speed[np.maximum(times, 0), agents])
+    return np.where(np.isnan(speed), episode.speed[moments[:, :1], agents], speed).astype(np.float64)

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from study.config.paper import ACCELERATIONS, STEERING_CROP
 from study.config.settings import BirdviewSettings, FramesSettings
-from study.data.birdview import Moments, governing_light, valid_moments
-from study.data.limits import speed_limits
+from study.data.birdview import Moments, valid_moments
+from study.data.limits import Limits
+from study.data.true_state import state_of
 from study.episode.files import read_episode
 from study.episode.schema import RATE_HZ, Episode
 from study.errors import BadInputError
@@ -74,12 +75,8 @@ def candidates(path: Path, number: int, name: str, frames: FramesSettings, birdv
         "train": np.ones(len(moments), bool),
         "steering": episode.steering[at],
         "acceleration": np.searchsorted(ACCELERATIONS, episode.acceleration[at]),
-        "speed": episode.speed[at],
-        "light": governing_light(episode, birdview, moments),
-        "light_distance": episode.light_distance[at],
-        "lead_gap": episode.lead_gap[at],
+        **state_of(episode, moments, birdview, Limits(episode.lanes)),
         "standing": episode.speed[at] < STANDING,
-        "limit": speed_limits(episode, moments),
         **_commands_before(episode, moments),
         "weight": np.ones(len(moments)),
     }

@@ -14,41 +14,10 @@ from torch import Tensor
 from study.config.paper import LATENT
 from study.config.settings import SPEEDS
 from study.driving.driver import Policies
+from study.driving.observations import Encode, Observation, Observations
 from study.encoder.inputs import to_float
 from study.encoder.latents import encoder_of
 from study.errors import BadInputError
-
-Image = NDArray[np.uint8]
-
-
-class Observation(NamedTuple):
-    """What one driver sees: the bird view [64, 64, 3] uint8, the speeds [10] m/s of now and 0.1 s to 0.9 s ago.
-
-    `steering` and `level` are the command of 0.1 s ago, as it was applied; see `Commands`.
-    """
-
-    image: Image
-    speeds: NDArray[np.float32]
-    steering: float
-    level: int
-
-
-class Observations(NamedTuple):
-    """What S drivers see, each in a town of its own; fields as in `Observation`, with S first.
-
-    `driving` [S] bool: a drive that has ended keeps its last observation, so that a batch always has the same size.
-    """
-
-    image: Image
-    speeds: NDArray[np.float32]
-    steering: NDArray[np.float32]
-    level: NDArray[np.int64]
-    driving: NDArray[np.bool_]
-
-    def of(self, driver: int) -> Observation:
-        """Return what one driver sees, for it to keep."""
-        image, speeds = self.image[driver].copy(), self.speeds[driver].copy()
-        return Observation(image, speeds, float(self.steering[driver]), int(self.level[driver]))
 
 
 class Commands(NamedTuple):
@@ -110,15 +79,8 @@ class PolicyActor:
     follow z where the policies were given them (`policy.inputs`).
     """
 
-    sees = True
-
-    def __init__(
-        self,
-        name: str,
-        encode: Callable[[Observations], NDArray[np.float32]],
-        policies: Mapping[str, NDArray[Any]],
-    ) -> None:
-        self.name, self._encode, self._policies = name, encode, Policies(policies)
+    def __init__(self, name: str, encode: Encode, policies: Mapping[str, NDArray[Any]], *, sees: bool = True) -> None:
+        self.name, self.sees, self._encode, self._policies = name, sees, encode, Policies(policies)
         self.drivers, self._width = len(policies["steering_0_weight"]), len(policies["z_mean"])
         if self._width not in {LATENT, LATENT + SPEEDS}:
             raise BadInputError(
@@ -142,7 +104,7 @@ def _commands(steering: Tensor, logits: Tensor) -> Commands:
     return Commands(steering.numpy(), level.numpy())
 
 
-def image_encoder(weights: Mapping[str, NDArray[Any]]) -> Callable[[Observations], NDArray[np.float32]]:
+def image_encoder(weights: Mapping[str, NDArray[Any]]) -> Encode:
     """Return the function from what is seen to the latents of a trained encoder with these weights."""
     encoder = encoder_of(weights)
 

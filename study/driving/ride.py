@@ -10,8 +10,9 @@ import numpy as np
 from study.config.keys import drive_name
 from study.config.paper import ACCELERATIONS, STEERING_CROP
 from study.config.settings import SPEEDS, StudySettings
-from study.data.birdview import Renderer
-from study.driving.actors import Image
+from study.data.birdview import Image, Renderer
+from study.data.limits import Limits
+from study.data.true_state import Columns, live_state
 from study.driving.drives import Drive
 from study.episode.schema import Agent, Episode
 from study.errors import BadInputError
@@ -52,6 +53,7 @@ class Ride:
         self.route_start, self.route = starts[first], route_line(self.road.town, strips[first:])
         self.map = town_map(self.road.town)
         self.renderer: Renderer | None = None
+        self.known: Episode | None = None
         self.ended = self.reason = ""
         self.waited = 0.0  # standing, while the expert would go [s]
         self.collision: dict[str, Any] | None = None
@@ -65,7 +67,7 @@ class Ride:
         """Return the same ride, for another driver: what never changes is shared."""
         network = self.road.network
         fixed = [self.settings, self.drive, self.road.town, self.road.lights, network, self.map, self.route]
-        fixed += [self.road.fleet.town, self.renderer]
+        fixed += [self.road.fleet.town, self.renderer, self.known]
         return copy.deepcopy(self, {id(item): item for item in fixed})
 
     def observe(self) -> None:
@@ -78,14 +80,14 @@ class Ride:
     def paint_map(self) -> Renderer:
         """Return the renderer, whose map is painted once for this ride and its copies."""
         if self.renderer is None:
-            self.renderer = Renderer(self._live(), self.settings.birdview, ())
+            self.renderer = Renderer(self._live, self.settings.birdview, ())
         return self.renderer
 
     def view(self) -> Image:
         """Return what the ego sees after `observe`, [64, 64, 3] uint8: the bits that its Episode renders to."""
         renderer = self.paint_map()
-        if renderer.episode.x is not self.recorder.arrays["x"]:
-            self.renderer = renderer = renderer.on(self._live())
+        if renderer.episode is not self._live:
+            self.renderer = renderer = renderer.on(self._live)
         images, _ = renderer.render(np.array([[self.recorder.step, self.agent]]))
         return np.asarray(images[0])
 
@@ -98,6 +100,11 @@ class Ride:
             return speeds, 0.0, 0
         last = arrays["acceleration"][now - 1, self.agent]
         return speeds, float(arrays["steering"][now - 1, self.agent]), ACCELERATIONS.index(float(last))
+
+    def state(self, limits: Limits) -> Columns:
+        """Return what the expert decides by, of the last step that was observed, as `Observations` has it."""
+        step = max(self.recorder.step - bool(self.ended), 0)
+        return live_state(self._live, np.array([[step, self.agent]]), self.settings.birdview, limits)
 
     def act(self, steering: float, level: float) -> None:
         """Follow a command, the steering cropped; one that is none ends the drive as a failure."""
@@ -158,8 +165,14 @@ class Ride:
         }
         return {"agent": int(self.recorder.seen[-1]["agent"][other]), **poses}
 
+    @property
     def _live(self) -> Episode:
         """Return the Episode so far, whose arrays are those that the recorder fills."""
+        if self.known is None or self.known.x is not self.recorder.arrays["x"]:
+            self.known = self._so_far()
+        return self.known
+
+    def _so_far(self) -> Episode:
         arrays = self.recorder.arrays
         columns = arrays["x"].shape[1]
         lanes, lights = self.map

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 
 from study.config.paper import IMAGE, STEERING_CROP
 from study.config.settings import SPEEDS, StudySettings
-from study.driving.actors import Actor, Expert, Observations
+from study.data.limits import Limits
+from study.data.true_state import Columns
+from study.driving.actors import Actor, Expert
 from study.driving.drives import Drive
+from study.driving.observations import Observations
 from study.driving.ride import Ride
 from study.episode.schema import Episode
 from study.errors import BadInputError
@@ -30,7 +35,7 @@ def rollout(drive: Drive, actor: Actor, settings: StudySettings, *, crop: float 
     if actor.sees:
         first.paint_map()
     rides = [first, *(first.copy() for _ in range(actor.drivers - 1))]
-    seen = _nothing(actor.drivers)
+    seen = _nothing(rides)
     while any(not ride.ended for ride in rides):
         for place, ride in enumerate(rides):
             seen.driving[place] = not ride.ended
@@ -61,11 +66,18 @@ def _step(rides: list[Ride], actor: Actor, seen: Observations) -> None:
             ride.act(float(commands.steering[place]), float(commands.level[place]))
 
 
-def _nothing(drivers: int) -> Observations:
+def _nothing(rides: list[Ride]) -> Observations:
+    drivers, limits = len(rides), cache(lambda: Limits(rides[0].map[0]))
+
+    def state() -> Columns:
+        rows = [ride.state(limits()) for ride in rides]
+        return {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}
+
     return Observations(
         np.zeros((drivers, IMAGE, IMAGE, 3), np.uint8),
         np.zeros((drivers, SPEEDS), np.float32),
         np.zeros(drivers, np.float32),
         np.zeros(drivers, np.int64),
         np.zeros(drivers, bool),
+        state,
     )

@@ -55,6 +55,12 @@ class CellResult:
     predictions: Arrays
     facts: dict[str, Any]
 
+    @property
+    def study(self) -> StudySettings:
+        """Return the settings of the study that the cell is of."""
+        groups = {name: group for name, group in self.settings.items() if name not in {"policy_seeds", "frames_key"}}
+        return StudySettings.model_validate(groups)
+
     def save(self, folder: Path) -> Path:
         """Write the result as `folder`, atomically."""
         head = {
@@ -106,9 +112,7 @@ def load_results(folder: Path) -> Iterator[CellResult]:
 
 def _check(result: CellResult) -> None:
     """Raise ValueError, KeyError or TypeError where a result does not fit its own settings."""
-    groups = dict(result.settings)
-    seeds, frames = groups.pop("policy_seeds"), groups.pop("frames_key")
-    settings = StudySettings.model_validate(groups)
+    settings, seeds, frames = result.study, *(result.settings[name] for name in ("policy_seeds", "frames_key"))
     if cell_key(settings, result.cell, seeds, frames) != result.key:
         raise ValueError("its settings have another key")
     if set(result.curves.columns) != set(CURVE_COLUMNS):
