@@ -15,6 +15,7 @@ from study.config.paper import CHANNELS, CORE, IMAGE, KERNEL, LATENT, STRIDE
 from study.randomness import rng
 
 _CORE_NUMBERS = CHANNELS[-1] * CORE * CORE
+CHANNEL_BLOCK = 8  # channels that a GPU's matrix units take at once
 PIXELS = HEADS["rec"].channels * IMAGE * IMAGE
 
 
@@ -23,7 +24,38 @@ class _Convolution(nn.Conv2d):
 
     def forward(self, input: Tensor) -> Tensor:  # noqa: A002 - torch's name
         assert self.bias is not None
-        return functional.conv2d(input, self.weight, self.bias.detach(), self.stride)
+        if input.device.type == "cpu" or self.in_channels >= CHANNEL_BLOCK:
+            return functional.conv2d(input, self.weight, self.bias.detach(), self.stride)
+        return _convolve_blocks(input, self.weight, self.bias.detach())
+
+
+def _convolve_blocks(images: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    """Return the convolution, kernel 4 and stride 2, of images with even sides, as one with kernel 2 and stride 1.
+
+    Blocks of 2x2 pixels become one pixel with four times the channels. A GPU's matrix units want channels by the
+    eight, so some of zeros are added.
+    """
+    extra = -4 * images.shape[1] % CHANNEL_BLOCK
+    blocks = functional.pad(functional.pixel_unshuffle(images, STRIDE), (0, 0, 0, 0, 0, extra))
+    kernels = functional.pad(functional.pixel_unshuffle(weight, STRIDE), (0, 0, 0, 0, 0, extra))
+    return functional.conv2d(blocks, kernels, bias)
+
+
+def _interleave_blocks(images: Tensor, weight: Tensor, channels: int) -> Tensor:
+    """Return the transposed convolution, kernel 4 and stride 2, as one with kernel 2 to four times the channels.
+
+    See `_SubPixel`, and `_convolve_blocks` for the channels of zeros.
+    """
+    kernels = functional.pad(_sub_kernels(weight), (0, 0, 0, 0, 0, 0, 0, -4 * channels % CHANNEL_BLOCK))
+    blocks = functional.conv2d(images, kernels, padding=1)[:, : 4 * channels]
+    corners = blocks.unflatten(1, (2, 2, channels))  # [B, 2, 2, D, H + 1, W + 1]
+    return corners.permute(0, 3, 4, 1, 5, 2).flatten(4, 5).flatten(2, 3)
+
+
+def _sub_kernels(weight: Tensor) -> Tensor:
+    """Return the 2x2 kernels [4 D, C, 2, 2] of the four outputs of each pixel, of weight [C, D, 4, 4]."""
+    corners = weight.reshape(*weight.shape[:2], 2, 2, 2, 2).flip(2, 4)  # the kernel's halves, then odd and even
+    return corners.permute(3, 5, 1, 0, 2, 4).flatten(0, 2)
 
 
 class _SubPixel(torch.autograd.Function):
@@ -39,9 +71,7 @@ class _SubPixel(torch.autograd.Function):
         ctx.save_for_backward(images, weight)
         ctx.extra = extra
         channels = weight.shape[1]
-        corners = weight.reshape(*weight.shape[:2], 2, 2, 2, 2).flip(2, 4)  # the kernel's halves, then odd and even
-        kernels = corners.permute(3, 5, 1, 0, 2, 4).flatten(0, 2)
-        blocks = functional.conv2d(images, kernels, bias.repeat(4), padding=1).permute(0, 2, 3, 1)
+        blocks = functional.conv2d(images, _sub_kernels(weight), bias.repeat(4), padding=1).permute(0, 2, 3, 1)
         rows, columns = blocks.shape[1:3]
         output = blocks.new_empty(len(images), 2 * rows + extra, 2 * columns + extra, channels)
         output[:, 2 * rows :] = bias  # out of every kernel's reach
@@ -70,6 +100,8 @@ def _transposed(layer: nn.ConvTranspose2d, images: Tensor, bias: Tensor) -> Tens
             images, layer.weight.to(images.dtype), bias.to(images.dtype), extra
         )
         return output
+    if layer.out_channels < CHANNEL_BLOCK and not extra:
+        return _interleave_blocks(images, layer.weight, layer.out_channels) + bias.view(-1, 1, 1)
     return functional.conv_transpose2d(images, layer.weight, bias, STRIDE, output_padding=extra)
 
 
