@@ -5,12 +5,13 @@ Drives and frames carry their key in their path, so what is there is used again.
 python -m study.data build --profile laptop
 python -m study.data card
 python -m study.data preview
+python -m study.data convert sumo|commonroad|highd SOURCE... --out DIR
 python -m study.data import DIR
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from pkgutil import resolve_name  # the work is imported when it begins: --help needs none of it
 from typing import Any
@@ -77,6 +78,52 @@ def import_(folder: Path, out: Path | None, check: bool, drop_bad: bool) -> int:
     if check:
         return int(resolve_name("study.data.commands:check_folder")(folder))
     return int(resolve_name("study.data.commands:import_folder")(folder, out, HERE, drop_bad))
+
+
+@data.group(no_args_is_help=False)
+def convert() -> None:
+    """Write recordings and scenarios of others as Episodes, to import (docs/extend/convert.md)."""
+
+
+SECONDS = click.FloatRange(min=0, min_open=True)
+
+
+def _converter(name: str, sources: str, *options: Decorator) -> Decorator:
+    """Give `convert` a command that calls the function `convert` of a module in `study.convert`."""
+    common: tuple[Decorator, ...] = (
+        click.argument("sources", metavar=sources, type=Path, nargs=-1, required=True),
+        click.option("--out", type=Path, metavar="DIR", required=True, help="a new folder for the drives"),
+        click.option("--cut", type=SECONDS, default=60.0, metavar="S", help="length of the drives, about [60 s]"),
+    )
+
+    def decorate(describe: Callable[..., Any]) -> Any:
+        def command(**values: Any) -> int:
+            return int(resolve_name("study.data.commands:convert")(name, **values))
+
+        for option in reversed((*common, *options)):
+            command = option(command)
+        return convert.command(name, help=describe.__doc__)(command)
+
+    return decorate
+
+
+def _files(name: str, text: str) -> Decorator:
+    return click.option(name, type=Path, multiple=True, metavar="FILE", help=f"{text}; may be given again")
+
+
+@_converter(
+    "sumo",
+    "SCENARIO.sumocfg...|NET.net.xml",
+    _files("--fcd", "fcd-output of vehicles on the net"),
+    _files("--routes", "with --fcd: vehicle types and routes"),
+    click.option("--tls-states", type=Path, metavar="FILE", help="with --fcd: SaveTLSStates output"),
+    click.option("--lights/--no-lights", default=True, help="the net's traffic lights"),
+    click.option("--drives", type=click.IntRange(min=1), default=1, metavar="N", help="runs, seeds from 0 on [1]"),
+    click.option("--warm-up", type=click.FloatRange(min=0), default=0.0, metavar="S", help="run first [0 s]"),
+    click.option("--seconds", type=SECONDS, default=60.0, metavar="S", help="then recorded of each run [60 s]"),
+)
+def _sumo() -> None:
+    """Run scenarios of Eclipse SUMO, or read the FCD output of a net."""
 
 
 def main(args: Sequence[str]) -> int:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import sys
+from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +20,7 @@ from study.engine.flows import run_flow
 from study.engine.local import local_engine
 from study.episode.imported import open_import
 from study.episode.importing import check_drives, describe, import_drives
-from study.errors import EXIT_BAD_INPUT
+from study.errors import EXIT_BAD_INPUT, BadInputError
 from study.stages import Flow, data_cost, recording_cost
 
 
@@ -64,6 +67,16 @@ def check_folder(folder: Path) -> int:
         errors += not finding.warning
     print(f"{errors} findings, {warnings} warnings")
     return EXIT_BAD_INPUT if errors else 0
+
+
+def convert(name: str, sources: Sequence[Path], out: Path, cut: float, **options: Any) -> int:
+    """Write drives with the converter of this name, and print them and their folder. Returns exit code 0."""
+    for option, value in {"cut": cut, **options}.items():
+        if isinstance(value, float) and not math.isfinite(value):
+            raise BadInputError(f"--{option.replace('_', '-')}: {value} is not a number of seconds")
+    converter = import_module(f"study.convert.{name}")
+    print(*converter.convert(sources, out, cut, **options), out, sep="\n")
+    return 0
 
 
 def _run(flow: Flow[Any], title: str, seconds: float, workers: int, workspace: Workspace) -> Any:

@@ -62,7 +62,7 @@ def adapt(episode: Episode, source: str) -> Adapted:
     Raises BadInputError for rates below 2 Hz.
     """
     original = {"rate_hz": episode.rate_hz, "labels": episode.labels, "digest": episode.digest}
-    complete = _fill_progress(_resample(episode, source))
+    complete = _fill_progress(resample(episode, source))
     return _fill_commands(dataclasses.replace(complete, source=episode.source | {"imported": original}, digest=""))
 
 
@@ -73,7 +73,8 @@ def _may_be_ego(episode: Episode) -> Bools:
 # --- rate -----------------------------------------------------------------------------------------------------------
 
 
-def _resample(episode: Episode, source: str) -> Episode:
+def resample(episode: Episode, source: str) -> Episode:
+    """Return the Episode at 10 Hz (see above). Raises BadInputError, which names `source`, for rates below 2 Hz."""
     rate = episode.rate_hz
     if abs(rate - RATE_HZ) < 1e-9:
         return episode
@@ -165,11 +166,11 @@ def _fill_progress(episode: Episode) -> Episode:
         missing = np.flatnonzero(episode.present[:, column] & ~np.isfinite(progress[:, column]))
         if len(route) > 1 and len(missing):
             points = np.stack([episode.x[missing, column], episode.y[missing, column]], axis=1).astype(np.float64)
-            progress[missing, column] = _along(route.astype(np.float64), points)
+            progress[missing, column] = progress_along(route.astype(np.float64), points)
     return dataclasses.replace(episode, route_s=progress)
 
 
-def _along(route: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+def progress_along(route: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the arclength [M] of the route's point nearest to each of the points [M, 2], NaN where it is far away.
 
     A route may cross itself: after the first point, only the part near the previous one is searched.

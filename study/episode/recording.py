@@ -63,7 +63,7 @@ class Recording:
             if (first, last) == (0, self.steps):
                 yield self
             else:
-                yield self._part(first, last)
+                yield self.part(first, last)
 
     def _spans(self, first: int, last: int) -> Iterator[tuple[int, int]]:
         begin, end = np.searchsorted(self.rows["step"], [first, last])
@@ -75,7 +75,8 @@ class Recording:
             yield from self._spans(first, middle)
             yield from self._spans(middle, last)
 
-    def _part(self, first: int, last: int) -> Recording:
+    def part(self, first: int, last: int) -> Recording:
+        """Return the steps from `first` to `last`, without it, with the agents that are there during them."""
         begin, end = np.searchsorted(self.rows["step"], [first, last])
         rows = select(self.rows, slice(begin, end))
         there, column = np.unique(rows["agent"], return_inverse=True)
