@@ -4,6 +4,7 @@ import json
 import math
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +13,18 @@ import pytest
 
 from benchmarks.motorway import import_memory, write_motorway
 from study.config.files import load_profile
+from study.config.keys import content_key
+from study.config.settings import FramesSettings
 from study.data.__main__ import main
 from study.data.birdview import valid_moments
 from study.episode.files import read_episode, write_episode
 from study.episode.findings import Findings
+from study.episode.imported import Drive, Imported, open_import
 from study.episode.importing import check_drives, import_drives
 from study.episode.motion import motion_faults
 from study.episode.rows import episode_rows
 from study.errors import BadInputError
+from study.randomness import rng as rng_of
 from study.sim.record import record_episode
 from tests.support.drives import crossing_drive, write_drives
 from tests.support.spoil import spoil
@@ -457,6 +462,49 @@ def test_a_long_recording_is_cut_into_parts_that_hold_what_it_holds(tmp_path, mo
     assert sum(part.present.sum() for part in parts) == pytest.approx(len(table) / 2.5, rel=0.02)
     assert {agent.id for part in parts for agent in part.agents} == set(range(60))
     assert all(len(valid_moments(part, load_profile("smoke").birdview)) for part in parts)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_parts_of_one_recording_serve_one_set(seed):
+    """Any number of recordings of any number of parts; those that were not cut are assigned as they ever were."""
+    rng = np.random.default_rng(seed)
+    parts = rng.integers(1, 7, rng.integers(4, 9))
+    drives = tuple(
+        Drive(f"log{number}-part-{part:03d}", f"{number} {part}", 1, 1, 1.0, 0, 0, f"log{number}")
+        for number, count in enumerate(parts)
+        for part in range(count)
+    )
+    imported = Imported(Path("imported"), drives)
+    frames = FramesSettings(seed=seed)
+    encoder, policy = imported.assign(frames)
+    assert sorted(path.name for path in (*encoder, *policy)) == sorted(drive.name for drive in drives)
+    logs = [{path.name.partition("-")[0] for path in paths} for paths in (encoder, policy)]
+    assert not logs[0] & logs[1]
+    assert min(map(len, logs)) >= 2
+    single = Imported(Path("imported"), tuple(replace(drive, recording=drive.name) for drive in drives))
+    order = rng_of(seed, "imported drives").permutation(len(drives))
+    count = min(max(round(len(drives) * frames.encoder / (frames.encoder + frames.policy)), 2), len(drives) - 2)
+    assert [path.name for path in single.assign(frames)[0]] == sorted(drives[place].name for place in order[:count])
+    assert single.key != imported.key
+    assert single.key == content_key("imported", sorted((drive.name, drive.digest) for drive in drives), (), 1)
+
+
+def test_parts_are_remembered_and_an_import_that_lacks_them_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("study.episode.recording.MOST_CELLS", 20_000)
+    write_motorway(tmp_path / "log/motorway", steps=3000, agents=60, alive=6)
+    write_drives(tmp_path / "log", 1, cars=4, steps=60)
+    imported = import_drives(tmp_path / "log", tmp_path / "out")
+    assert open_import(tmp_path / "out") == imported
+    assert set(imported.recordings.values()) == {"motorway"}
+    assert "drive-000" not in imported.recordings
+    with pytest.raises(BadInputError, match=r"has 2 recordings .parts of one stay together"):
+        imported.assign(FramesSettings())
+    content = json.loads((tmp_path / "out/import.json").read_text())
+    for drive in content["drives"]:
+        del drive["recording"]
+    (tmp_path / "out/import.json").write_text(json.dumps(content))
+    with pytest.raises(BadInputError, match="import again"):
+        open_import(tmp_path / "out")
 
 
 @pytest.mark.stress

@@ -11,6 +11,7 @@ from study.errors import BadInputError
 from tests.support.drives import write_drives
 
 VIEW = BirdviewSettings()
+TEN = [f"drive {number}" for number in range(10)]  # each a recording of its own
 STEERING = np.array([0.1, 0.1, 0.1, 0.4, 0.1, 0.1, 0.1])
 CLASSES = np.full(3, 1 / 3)
 STAND = np.array([0.92, 0.08])
@@ -68,7 +69,7 @@ def test_standing_moments_are_thinned_for_the_encoder_set_only(drives):
 
 def test_drives_are_split_before_frames(pool):
     """Exact sizes, and no drive on both sides."""
-    rows, decided, test_drives = choose(pool, "encoder", 200, 10, FramesSettings())
+    rows, decided, test_drives = choose(pool, "encoder", 200, TEN, FramesSettings())
     train = decided["train"]
     assert len(np.unique(rows)) == 200
     assert train.sum() == 160
@@ -77,15 +78,37 @@ def test_drives_are_split_before_frames(pool):
     assert not set(pool["episode"][rows[train]]) & set(test_drives)
 
 
+@pytest.mark.parametrize("seed", range(12))
+def test_parts_of_one_recording_are_never_on_both_sides(seed):
+    """Any number of recordings, cut into any number of parts, in any order: as near the share as whole ones can be."""
+    rng = np.random.default_rng(seed)
+    sizes = rng.integers(1, 6, rng.integers(2, 9))
+    recordings = rng.permutation(np.repeat([f"log {number}" for number in range(len(sizes))], sizes)).tolist()
+    drives = np.repeat(np.arange(len(recordings)), 40)
+    columns = {"episode": drives, "step": np.arange(len(drives))}
+    wanted = len(drives) // 5
+    rows, decided, test_drives = choose(columns, "encoder", wanted, recordings, FramesSettings(seed=seed))
+    sides = [{recordings[drive] for drive in drives[rows[side]]} for side in (decided["train"], ~decided["train"])]
+    assert all(sides)
+    assert not sides[0] & sides[1]
+    assert {drive for drive in range(len(recordings)) if recordings[drive] in sides[1]} == set(test_drives)
+    assert abs(len(test_drives) - 0.2 * len(recordings)) <= sizes.max()
+
+
+def test_drives_of_a_single_recording_cannot_be_split(pool):
+    with pytest.raises(BadInputError, match=r"of 1 recording.*frames\.split frame"):
+        choose(pool, "encoder", 100, ["log"] * 10, FramesSettings())
+
+
 def test_the_literal_split_mixes_frames_of_a_drive(pool):
-    rows, decided, test_drives = choose(pool, "encoder", 200, 10, FramesSettings(split="frame"))
+    rows, decided, test_drives = choose(pool, "encoder", 200, TEN, FramesSettings(split="frame"))
     train = decided["train"]
     assert (len(rows), train.sum(), test_drives) == (200, 160, [])
     assert set(pool["episode"][rows[~train]]) <= set(pool["episode"][rows[train]])
 
 
 def test_seeds_choose_differently_and_repeatably(pool):
-    first, again, other = (choose(pool, "encoder", 200, 10, FramesSettings(seed=seed))[0] for seed in (0, 0, 1))
+    first, again, other = (choose(pool, "encoder", 200, TEN, FramesSettings(seed=seed))[0] for seed in (0, 0, 1))
     np.testing.assert_array_equal(first, again)
     assert not np.array_equal(first, other)
 
@@ -94,7 +117,7 @@ def test_the_policy_set_has_the_shares_it_should_have(pool):
     """Each split by itself: the drives have enough of everything at this size."""
     before = histograms(pool, np.ones(len(pool["step"]), bool))
     assert abs(before["standing"] / before["frames"] - 0.08) > 0.1  # else the test could not fail
-    rows, decided, _ = choose(pool, "policy", 250, 10, FramesSettings())
+    rows, decided, _ = choose(pool, "policy", 250, TEN, FramesSettings())
     train = decided["train"]
     for part, number in ((rows[train], 200), (rows[~train], 50)):
         after = histograms({key: values[part] for key, values in pool.items()}, np.ones(len(part), bool))
@@ -107,7 +130,7 @@ def test_the_policy_set_has_the_shares_it_should_have(pool):
 
 def test_weighted_policy_frames_are_distributed_as_the_moments_they_were_chosen_from(pool):
     """Only where raking leaves some frame of every kind: weights cannot speak for kinds that are gone."""
-    rows, decided, test_drives = choose(pool, "policy", 250, 10, FramesSettings())
+    rows, decided, test_drives = choose(pool, "policy", 250, TEN, FramesSettings())
     for part, inside in ((decided["train"], False), (~decided["train"], True)):
         weight, here = decided["weight"][part], np.isin(pool["episode"], test_drives) == inside
         assert weight.mean() == pytest.approx(1, abs=1e-5)
@@ -135,11 +158,11 @@ def test_a_keyframe_is_a_moment_whose_class_has_just_changed(drives):
 
 def test_balancing_on_steering_alone_leaves_the_rest(pool):
     """The control of the paper's words: steering is raked, classes follow the drives."""
-    rows, _, _ = choose(pool, "policy", 250, 10, FramesSettings(balance="steering"))
+    rows, _, _ = choose(pool, "policy", 250, TEN, FramesSettings(balance="steering"))
     after = histograms({key: values[rows] for key, values in pool.items()}, np.ones(250, bool))
     np.testing.assert_allclose(np.array(after["steering"]) / 250, STEERING, atol=0.03)
     assert after["acceleration"][0] / 250 > 0.45
-    rows, _, _ = choose(pool, "policy", 250, 10, FramesSettings(balance="none"))
+    rows, _, _ = choose(pool, "policy", 250, TEN, FramesSettings(balance="none"))
     natural = histograms({key: values[rows] for key, values in pool.items()}, np.ones(250, bool))
     before = histograms(pool, np.ones(len(pool["step"]), bool))
     np.testing.assert_allclose(
@@ -150,7 +173,7 @@ def test_balancing_on_steering_alone_leaves_the_rest(pool):
 @pytest.mark.parametrize(("name", "setting"), [("encoder", "recording.encoder_episodes"), ("policy", "frames.policy")])
 def test_too_few_candidates_are_refused_with_the_setting_to_change(pool, name, setting):
     with pytest.raises(BadInputError, match=rf"{name} set needs 8000 training frames and its drives give .*{setting}"):
-        choose(pool, name, 10_000, 10, FramesSettings())
+        choose(pool, name, 10_000, TEN, FramesSettings())
 
 
 def margins(counts, axis):

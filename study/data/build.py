@@ -7,9 +7,10 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -40,18 +41,22 @@ def frames_flow(
     folder: Path,
     *,
     key: str | None = None,
+    recordings: Mapping[str, str] = MappingProxyType({}),
 ) -> Flow[None]:
     """Build the frame store `folder` from recorded drives, unless it exists and is undamaged.
 
     Every drive is read once for its candidate moments, the frames are chosen from all of them (`choose`), then the
     frames of every drive are painted into their rows of preallocated files. Each painted part leaves a note, so that a
-    killed build resumes and ends with the same bytes. `key` names the store; by default it follows from the settings
+    killed build resumes and ends with the same bytes. `recordings`: drive -> what it was cut from; drives of one
+    recording train or test, never both. `key` names the store; by default it follows from the settings
     and the drives' digests. Raises BadInputError when the drives give too few frames, serve both sets or are no
     Episodes, or when `folder` holds something else.
     """
     sources = {"encoder": _sources(encoder_episodes), "policy": _sources(policy_episodes)}
     _check_sources(sources)
-    build = _Build(frames, birdview, {"encoder": encoder_episodes, "policy": policy_episodes}, sources, folder, key)
+    build = _Build(
+        frames, birdview, {"encoder": encoder_episodes, "policy": policy_episodes}, sources, folder, key, recordings
+    )
     folder.parent.mkdir(parents=True, exist_ok=True)
     with FileLock(folder.parent / ".lock"):
         if not build.finished():
@@ -86,6 +91,7 @@ class _Build:
     sources: dict[str, list[dict[str, str]]]
     folder: Path
     given_key: str | None
+    recordings: Mapping[str, str]
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -99,6 +105,13 @@ class _Build:
     def inputs(self) -> str:
         """Return the digest of everything that decides the bytes of the store."""
         inputs = {**self.settings, "sources": self.sources, **({"masks": further_masks()} if further_masks() else {})}
+        if cut := {
+            path.name: name
+            for paths in self.paths.values()
+            for path in paths
+            if (name := self.recordings.get(path.name))
+        }:
+            inputs["recordings"] = cut
         return content_key("frames", inputs, (), FORMAT_VERSIONS["frames"])
 
     @property
@@ -182,7 +195,8 @@ class _Build:
             last = first + len(self.paths[name])
             columns = {key: np.concatenate([table[key] for table in tables[first:last]]) for key in LABELS}
             first = last
-            rows, decided, test_drives = choose(columns, name, wanted, len(self.paths[name]), self.frames)
+            groups = [self.recordings.get(path.name, path.name) for path in self.paths[name]]
+            rows, decided, test_drives = choose(columns, name, wanted, groups, self.frames)
             before = histograms(columns, np.ones(len(columns["step"]), bool))
             chosen = {key: values[rows] for key, values in columns.items()} | decided
             train = decided["train"]

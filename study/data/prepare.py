@@ -62,7 +62,15 @@ def data_flow(settings: StudySettings, root: Path = HERE.data, imported: Importe
         drives = yield from drives_flow(settings, root)
         split = settings.recording.encoder_episodes
         encoder_drives, policy_drives = drives[:split], drives[split:]
-    yield from frames_flow(settings.frames, settings.birdview, encoder_drives, policy_drives, folder, key=folder.name)
+    yield from frames_flow(
+        settings.frames,
+        settings.birdview,
+        encoder_drives,
+        policy_drives,
+        folder,
+        key=folder.name,
+        recordings=imported.recordings if imported else {},
+    )
     return folder
 
 

@@ -7,6 +7,7 @@ bins, acceleration classes and standing vehicles have the shares that the settin
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from study.data.birdview import Moments, valid_moments
 from study.data.limits import Limits
 from study.data.true_state import state_of
 from study.episode.files import read_episode
+from study.episode.imported import take_groups
 from study.episode.schema import RATE_HZ, Episode
 from study.errors import BadInputError
 from study.randomness import rng
@@ -99,9 +101,13 @@ def _commands_before(episode: Episode, moments: Moments) -> Columns:
 
 
 def choose(
-    columns: Columns, name: str, wanted: int, drives: int, settings: FramesSettings
+    columns: Columns, name: str, wanted: int, recordings: Sequence[str], settings: FramesSettings
 ) -> tuple[Indices, Columns, list[int]]:
-    """Return the rows of the chosen candidates, sorted, their columns "train" and "weight", and the test drives."""
+    """Return the rows of the chosen candidates, sorted, their columns "train" and "weight", and the test drives.
+
+    `recordings`: what each drive was cut from. Drives of one recording train or test, never both. Raises BadInputError
+    when the drives give too few frames, or are all of one recording.
+    """
     generator = rng(settings.seed, f"frames {name}")
     test = round(wanted * settings.test_share)
     balance = settings.balance if name == "policy" else "none"
@@ -111,8 +117,7 @@ def choose(
         train = np.ones(wanted, bool)
         train[generator.permutation(wanted)[:test]] = False
         return rows, {"train": train, "weight": weight}, []
-    count = min(max(1, round(drives * settings.test_share)), drives - 1)
-    test_drives = np.sort(generator.permutation(drives)[:count])
+    test_drives = _test_drives(recordings, name, settings.test_share, generator)
     in_test = np.isin(columns["episode"], test_drives)
     parts = [
         _sample(columns, np.flatnonzero(pool), number, balance, name, f" {split}", settings, generator)
@@ -121,6 +126,20 @@ def choose(
     rows, weight = (np.concatenate(part) for part in zip(*parts, strict=True))
     order = np.argsort(rows, kind="stable")
     return rows[order], {"train": ~in_test[rows[order]], "weight": weight[order]}, test_drives.tolist()
+
+
+def _test_drives(recordings: Sequence[str], name: str, share: float, generator: np.random.Generator) -> Indices:
+    """Return the drives of random recordings, about this share of all drives, sorted."""
+    names = list(dict.fromkeys(recordings))
+    if len(names) < 2:
+        raise BadInputError(
+            f"the {name} set has drives of {len(names)} recording; it needs one to train and one to test: import more, "
+            "or choose --frames.split frame"
+        )
+    sizes = [recordings.count(each) for each in names]
+    order = generator.permutation(len(names)).tolist()
+    taken = {names[group] for group in take_groups(sizes, order, round(len(recordings) * share), 1)}
+    return np.array([number for number, each in enumerate(recordings) if each in taken], np.int64)
 
 
 def _sample(

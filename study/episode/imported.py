@@ -2,14 +2,18 @@
 
 The folder holds one adapted Episode for each that was found (see `study.episode.importing`), and
 
-`import.json`   schema_version 1; drives: [{"name", "digest", "agents", "egos", "seconds", "derived", "skipped"}]
+`import.json`   schema_version 1; drives: [{"name", "digest", "agents", "egos", "seconds", "derived", "skipped",
+                "recording"}]
 """
 
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from study.config.keys import content_key
 from study.config.settings import FramesSettings
@@ -22,7 +26,10 @@ SCHEMA_VERSION = 1
 
 @dataclass(frozen=True)
 class Drive:
-    """One imported drive; `derived` and `skipped` count moments of its egos, by command (see `study.episode.adapt`)."""
+    """One imported drive; `derived` and `skipped` count moments of its egos, by command (see `study.episode.adapt`).
+
+    `recording`: name of what it was cut from, its own name where that was not cut.
+    """
 
     name: str
     digest: str
@@ -31,6 +38,14 @@ class Drive:
     seconds: float
     derived: int
     skipped: int
+    recording: str
+
+
+def take_groups(sizes: Sequence[int], order: Sequence[int], wanted: int, least: int) -> list[int]:
+    """Return the first groups in this order that hold about `wanted` items; `least` groups at least, here and left."""
+    taken = [sum(sizes[group] for group in order[:count]) for count in range(len(order) + 1)]
+    count = min(range(least, len(order) - least + 1), key=lambda count: abs(taken[count] - wanted))
+    return list(order[:count])
 
 
 @dataclass(frozen=True)
@@ -43,7 +58,14 @@ class Imported:
     @property
     def key(self) -> str:
         """Return the key that stands for these drives in the keys of all that is made from them."""
-        return content_key("imported", sorted((drive.name, drive.digest) for drive in self.drives), (), SCHEMA_VERSION)
+        drives = sorted((drive.name, drive.digest) for drive in self.drives)
+        cut = sorted(self.recordings.items())  # decides which drives go together, hence who tests whom
+        return content_key("imported", [*drives, cut] if cut else drives, (), SCHEMA_VERSION)
+
+    @property
+    def recordings(self) -> dict[str, str]:
+        """Return drive -> recording of those that were cut from one. Parts of a recording stay in one set."""
+        return {drive.name: drive.recording for drive in self.drives if drive.recording != drive.name}
 
     @property
     def writers(self) -> list[str]:
@@ -60,18 +82,24 @@ class Imported:
     def assign(self, frames: FramesSettings) -> tuple[list[Path], list[Path]]:
         """Return random drives for the encoder set and the others for the policy set, in proportion to their frames.
 
-        Raises BadInputError when there are fewer than four: each set needs one to train and one to test.
+        Parts of one recording stay together. Raises BadInputError when there are fewer than four recordings: each set
+        needs one to train and one to test.
         """
-        count = len(self.drives)
-        if count < 4:
+        groups: dict[str, list[Path]] = {}
+        for drive in self.drives:
+            groups.setdefault(drive.recording, []).append(self.folder / drive.name)
+        if len(groups) < 4:
+            cut = " (parts of one stay together, since they share vehicles and place)" if self.recordings else ""
             raise BadInputError(
-                f"{self.folder} has {count} drives and a sweep needs 4 or more: two for encoders and two for "
-                "policies, each one to train and one to test; import more, or cut long drives into several Episodes"
+                f"{self.folder} has {len(groups)} recordings{cut} and a sweep needs 4 or more: two for encoders and "
+                "two for policies, each one to train and one to test; import more, or cut long drives into several"
             )
-        order = rng(frames.seed, "imported drives").permutation(count).tolist()
-        split = min(max(round(count * frames.encoder / (frames.encoder + frames.policy)), 2), count - 2)
-        paths = [self.folder / self.drives[place].name for place in order]
-        return sorted(paths[:split]), sorted(paths[split:])
+        order = rng(frames.seed, "imported drives").permutation(len(groups)).tolist()
+        wanted = round(len(self.drives) * frames.encoder / (frames.encoder + frames.policy))
+        names = list(groups)
+        taken = take_groups([len(group) for group in groups.values()], order, wanted, 2)
+        encoder = sorted(path for number in taken for path in groups[names[number]])
+        return encoder, sorted(path for number in set(order) - set(taken) for path in groups[names[number]])
 
 
 def open_import(folder: Path) -> Imported:
@@ -83,10 +111,16 @@ def open_import(folder: Path) -> Imported:
             raise BadInputError(
                 f"{path}: schema_version is {content['schema_version']!r}; this program reads {SCHEMA_VERSION}"
             )
-        return Imported(folder, tuple(Drive(**drive) for drive in content["drives"]))
+        return Imported(folder, tuple(_drive(drive, path) for drive in content["drives"]))
     except OSError as error:
         raise BadInputError(
             f"cannot read {path}: {error.strerror}; make it with 'python -m study.data import DIR --out {folder}'"
         ) from error
     except (ValueError, KeyError, TypeError) as error:
         raise BadInputError(f"{path} lists no imported drives ({error!r}): import again") from error
+
+
+def _drive(entry: dict[str, Any], path: Path) -> Drive:
+    if "recording" not in entry and re.search(r"-part-\d{3}$", entry["name"]):
+        raise BadInputError(f"{path} does not say which drives are parts of one recording: import again")
+    return Drive(**{"recording": entry["name"]} | entry)

@@ -40,7 +40,8 @@ def import_drives(
     """Read all Episodes below `source`, adapt them, and write them as `out`: all of them, or nothing.
 
     With `drop_bad`, what is bad is left out; `tell` hears how much, and of warnings. A long recording of many agents
-    becomes several drives. An earlier import in `out` is replaced. The same Episodes give the same bytes.
+    becomes several drives, which stay in one set. An earlier import in `out` is replaced. The same Episodes give the
+    same bytes.
     Raises BadInputError for anything that is no Episode, naming file, row and field, for paths that lead out of
     `source`, and when `out` holds something else.
     """
@@ -119,17 +120,17 @@ def _import_recording(name: str, recording: Recording, findings: Findings, draft
         adapted = adapt(part.episode(), str(findings.folder))
         if not whole and not adapted.egos:
             continue
-        yield _write_drive(name if whole else f"{name}-part-{number:03d}", adapted, draft)
+        yield _write_drive(name if whole else f"{name}-part-{number:03d}", name, adapted, draft)
 
 
-def _write_drive(name: str, adapted: Adapted, draft: Path) -> Drive:
+def _write_drive(name: str, recording: str, adapted: Adapted, draft: Path) -> Drive:
     if (draft / name).exists():
         raise BadInputError(f"two drives would be imported as '{name}': rename one")
     episode = adapted.episode
     digest = write_episode(episode, draft / name)
     agents = int(episode.present.any(axis=0).sum())
     seconds = episode.steps / episode.rate_hz
-    return Drive(name, digest, agents, adapted.egos, seconds, adapted.derived, adapted.skipped)
+    return Drive(name, digest, agents, adapted.egos, seconds, adapted.derived, adapted.skipped, recording)
 
 
 def _find_episodes(source: Path) -> Iterator[tuple[str, Path]]:
