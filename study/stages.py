@@ -2,7 +2,7 @@
 
 A study is a graph of stages. Each is a pure function from settings and the products of earlier stages to one product:
 
-    record -> select -> render -> encoder -> latents -> policy -> result
+    record -> select -> render -> encoder -> latents -> policy -> result -> drive
 
 `STAGES` is the only list of them: progress words, cost estimates, keys and MLflow names derive from its records.
 `study.data` and `study.cell` arrange the stages in flows; `study.engine` runs them.
@@ -20,7 +20,7 @@ from typing import Any, TypeAlias, TypeVar
 from study.config.baselines import CEILING, SUPERVISED
 from study.config.grid import Cell
 from study.config.heads import HEAD_SETS, mask_heads
-from study.config.keys import cell_key, encoder_key, frames_key, recording_key
+from study.config.keys import cell_key, drive_key, encoder_key, frames_key, recording_key
 from study.config.paper import IMAGE
 from study.config.settings import StudySettings
 
@@ -34,6 +34,8 @@ ENCODED_PER_S = 6_000.0  # images encoded, on one core
 POLICY_FRAME_S = 1 / 500_000  # a frame forward and backward through one policy, on two cores
 SUPERVISED_EPOCHS = 20  # over the policy set, of the supervised baseline
 DRIVE_READ_S = 0.12  # a drive read again for the true state
+POLICY_STEP_S = 0.0015  # a step of one policy at the wheel, on two cores
+DRIVEN = 0.4  # share of their time that drives last: most end early
 RESULT_S = 5.0  # a result is assembled, exported and committed
 
 STATE_BYTES = 32  # of one vehicle at one step in an Episode
@@ -150,6 +152,13 @@ def _policy_seconds(work: Work) -> float:
     return work.policy_seeds * policy.epochs * shown * POLICY_FRAME_S
 
 
+def _drive_seconds(work: Work) -> float:
+    driving = work.settings.driving
+    policies = min(work.policy_seeds, driving.baseline_policies) if work.cell.baseline else work.policy_seeds
+    steps = (driving.drives + driving.unseen_towns) * driving.duration * STEP_HZ
+    return policies * steps * DRIVEN * POLICY_STEP_S
+
+
 def _cell_key(work: Work) -> str:
     return cell_key(work.settings, work.cell, work.policy_seeds, work.frames)
 
@@ -162,10 +171,11 @@ ENCODER = Stage("encoder", "encoder", "step", lambda w: encoder_key(w.settings, 
 LATENTS = Stage("latents", "encoding", "frame", ENCODER.key, _latents_seconds)
 POLICY = Stage("policy", "policies", "epoch", _cell_key, _policy_seconds)
 RESULT = Stage("result", "assembling the result", "cell", POLICY.key, lambda _: RESULT_S)
+DRIVE = Stage("drive", "driving", "drive", lambda work: drive_key(work.settings, _cell_key(work)), _drive_seconds)
 
 DATA_STAGES = (RECORD, SELECT, RENDER, DESCRIBE)
 CELL_STAGES = (ENCODER, LATENTS, POLICY, RESULT)
-STAGES = {stage.name: stage for stage in (*DATA_STAGES, *CELL_STAGES)}
+STAGES = {stage.name: stage for stage in (*DATA_STAGES, *CELL_STAGES, DRIVE)}
 
 
 def share_done(stages: Sequence[Stage], work: Work, stage: Stage, done: float) -> float:

@@ -7,24 +7,30 @@ functions of `study.cell.stages`, since the process that only plans and commits 
 from __future__ import annotations
 
 import math
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from study.cell.job import CellJob
+from study.config.keys import drive_key
+from study.config.settings import StudySettings
 from study.engine.room import with_room
 from study.errors import BadInputError
 from study.products import Product, read_product, write_product
 from study.results.cell_result import CellResult
-from study.stages import ENCODER, LATENTS, POLICY, RESULT, Batch, Flow, Stage, Task
+from study.results.drives import WAY
+from study.stages import DRIVE, ENCODER, LATENTS, POLICY, RESULT, Batch, Flow, Stage, Task
 
 SHARE_SECONDS = 40.0  # on one core of the reference machine, of a share of the policies: what a kill costs at most
 HEAD = "product.json"
-STAGE_MODULE = "study.cell.stages"
+STAGE_MODULE, DRIVING_MODULE = "study.cell.stages", "study.cell.driving"
+EXPERT_DRIVES = 5  # of the expert in one task: some ten seconds
 
 
 def cell_flow(job: CellJob, *, one_share: bool = False) -> Flow[tuple[CellResult, bytes]]:
@@ -51,6 +57,35 @@ def cell_flow(job: CellJob, *, one_share: bool = False) -> Flow[tuple[CellResult
     return result
 
 
+def expert_flow(settings: StudySettings, drives: Sequence[Any], products: Path) -> Flow[pd.DataFrame]:
+    """Have the expert drive, and return its drives, one row each."""
+    shares = [drives[first : first + EXPERT_DRIVES] for first in range(0, len(drives), EXPERT_DRIVES)]
+    folders = [products / f"drive-{drive_key(settings)}-{first}" for first in range(len(shares))]
+    tasks = [
+        Task(DRIVE, f"{DRIVING_MODULE}:drive_expert", (settings, share), len(share), reports=True) for share in shares
+    ]
+    driven = yield from _keep(folders, (), tasks)
+    return pd.concat([product.curves for product in driven], ignore_index=True)
+
+
+def drive_flow(job: CellJob, result: CellResult, drives: Sequence[Any], expert: pd.DataFrame) -> Flow[pd.DataFrame]:
+    """Have the policies of a finished cell drive, and return the drives, the expert's first.
+
+    Nothing of the tracker is needed: the weights are those of the result.
+    """
+    needed = replace(result, curves=result.curves[:0], samples={}, predictions={})
+    ways = dict(zip(expert["drive"], expert[WAY], strict=True))
+    count = math.ceil(len(drives) * SHARE_SECONDS / max(2 * DRIVE.cost(job.work), 1.0))
+    shares = [drives[first : first + count] for first in range(0, len(drives), count)]
+    folders = [job.products / f"drive-{DRIVE.key(job.work)}-{count}-{first}" for first in range(len(shares))]
+    tasks = [
+        Task(DRIVE, f"{DRIVING_MODULE}:drive_policies", (job, needed, share, ways), len(share), reports=True)
+        for share in shares
+    ]
+    driven = yield from _keep(folders, (), tasks)
+    return pd.concat([expert, *(product.curves for product in driven)], ignore_index=True)
+
+
 def _task(stage: Stage, function: str, *args: Any, weight: int = 1) -> Task:
     return Task(stage, f"{STAGE_MODULE}:{function}", args, weight, reports=True, accelerated=True)
 
@@ -58,6 +93,11 @@ def _task(stage: Stage, function: str, *args: Any, weight: int = 1) -> Task:
 def product_folders(job: CellJob) -> list[Path]:
     """Return the kept policies of a cell: nobody needs them once the cell is committed."""
     return list(job.products.glob(f"policies-{job.key}-*"))
+
+
+def driven_folders(job: CellJob) -> list[Path]:
+    """Return the kept drives of a cell: nobody needs them once they are committed."""
+    return list(job.products.glob(f"drive-{DRIVE.key(job.work)}-*"))
 
 
 def _keep(folders: list[Path], parts: tuple[str, ...], tasks: list[Task]) -> Generator[Batch, list[Any], list[Product]]:

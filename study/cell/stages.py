@@ -58,7 +58,7 @@ class Latents:
 
 def train_cell_encoder(job: CellJob, report: Reporter) -> Product:
     """Train the encoder. Raises BadInputError for settings that cannot be met, TrainingDivergedError for a bad loss."""
-    store, device, facts = _begin(job, report)
+    store, device, facts = begin(job, report)
     settings, cell = job.settings, job.cell
     trained = train_encoder(
         store.encoder,
@@ -81,7 +81,7 @@ def train_cell_encoder(job: CellJob, report: Reporter) -> Product:
 def encode_policy_set(job: CellJob, encoder: Product | None, report: Reporter) -> Latents:
     """Return the latents of the policy set: the encoder's, or what a baseline gives policies in their place."""
     started = time.perf_counter()
-    store, device, facts = _begin(job, report)
+    store, device, facts = begin(job, report)
     policy = store.policy
     part = policy.subset(job.settings.policy.share, "frame", job.settings.frames.seed)
     rows = {"train": part, "test": policy.indices("test")}
@@ -180,7 +180,7 @@ def assemble_result(
     return result, export_driver(result) if encoder else b""
 
 
-def _begin(job: CellJob, report: Reporter) -> tuple[FrameStore, str, dict[str, Any]]:
+def begin(job: CellJob, report: Reporter) -> tuple[FrameStore, str, dict[str, Any]]:
     """Return the frames, made here where they are missing, the device, and facts about what computes."""
     load_modules(job.modules)
     device = _set_up(job, report)

@@ -116,6 +116,7 @@ class Grid(Settings):
     baselines: Annotated[tuple[str, ...], Listed] = Field(
         tuple(BASELINES), description="cells without a head set to compare with (docs/reading-a-report.md); [] for none"
     )
+    drive: bool = Field(default=False, description="policies drive in closed loop, too (docs/drive.md)")
     claims: tuple[str, ...] = Field((), description="claims of the paper that this sweep tests")
     rules: Rules = Field(Rules(), description="when a claim counts as reproduced")
     settings: dict[str, Any] = Field(default_factory=dict, description="settings that differ from every profile's")

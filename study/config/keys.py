@@ -28,7 +28,7 @@ def content_key(stage: str, settings: object, inputs: tuple[str, ...], format_ve
 
 
 # Raised on purpose when a stage's code changes what it makes; a test holds each product's digest.
-FORMAT_VERSIONS = {"episodes": 3, "frames": 3, "encoder": 3, "baseline": 1, "cell": 3}
+FORMAT_VERSIONS = {"episodes": 3, "frames": 3, "encoder": 3, "baseline": 1, "cell": 3, "drive": 1}
 
 
 def recording_key(settings: StudySettings) -> str:
@@ -90,3 +90,14 @@ def cell_key(settings: StudySettings, cell: Cell, policy_seeds: int, frames: str
     """Key of a cell's result: its encoder and the policies on it."""
     parts = {"policy": settings.policy.model_dump(mode="json"), "policy_seeds": policy_seeds}
     return content_key("cell", parts, (encoder_key(settings, cell, frames),), FORMAT_VERSIONS["cell"])
+
+
+def drive_key(settings: StudySettings, cell: str = "") -> str:
+    """Key of the held-out drives of a cell's policies, given its key, or of the expert's."""
+    parts = {
+        "driving": settings.driving.model_dump(mode="json", exclude=None if cell else {"crop", "baseline_policies"}),
+        "birdview": settings.birdview.model_dump(mode="json"),
+        "seed": settings.recording.seed,
+    }
+    inputs = (recording_key(settings), cell) if cell else (recording_key(settings),)
+    return content_key("drive", parts, inputs, FORMAT_VERSIONS["drive"])

@@ -174,6 +174,20 @@ class PolicySettings(Settings):
         return LATENT + (SPEEDS if self.inputs == "z+speed" else 0)
 
 
+class DrivingSettings(Settings):
+    """Drives of policies in closed loop, in traffic that neither set holds (ours; the paper has none)."""
+
+    drives: Count = Field(20, description="held-out drives of each policy in the study's town")
+    unseen_towns: Annotated[int, Field(ge=0)] = Field(
+        5, description="held-out drives of each policy in other towns, each in one of its own"
+    )
+    duration: Positive = Field(60.0, description="length of a drive, unless something ends it [s]")
+    crop: Positive = Field(
+        0.42, description="steering is cropped to plus or minus this; at Sec. IV-C's 0.25 the expert misses right turns"
+    )
+    baseline_policies: Count = Field(5, description="policies of each baseline that drive")
+
+
 class StudySettings(Settings):
     """Every setting of every stage; a profile is one of these."""
 
@@ -184,3 +198,4 @@ class StudySettings(Settings):
     frames: FramesSettings = FramesSettings()
     encoder: EncoderSettings = EncoderSettings()
     policy: PolicySettings = PolicySettings()
+    driving: DrivingSettings = DrivingSettings()

@@ -7,7 +7,7 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Self
 
-from study.stages import CELL_STAGES, STAGES, Work, duration_text, share_done
+from study.stages import CELL_STAGES, STAGES, Stage, Work, duration_text, share_done
 
 try:
     from study.console import terminal
@@ -31,7 +31,7 @@ def show_table(rows: Sequence[Sequence[str]], styles: Sequence[str]) -> None:
 
 
 class Display:
-    """Shows how far a sweep is. `costs`: expected seconds of each waiting cell; `data_cost`: of the data stage.
+    """Shows how far a sweep is. `costs`: expected seconds of each waiting cell, in `stages`; `data_cost`: of the data.
 
     Times left are the expected ones times what the elapsed ones have shown them to be wrong by.
     """
@@ -43,9 +43,10 @@ class Display:
         labels: Mapping[str, str],
         data_cost: float,
         works: Mapping[str, Work] | None = None,
+        stages: Sequence[Stage] = CELL_STAGES,
     ) -> None:
         self._title, self._labels = title, labels
-        self._works = works or {}
+        self._works, self._stages = works or {}, stages
         self._costs = {DATA_KEY: data_cost, **costs}
         self._shares = dict.fromkeys(self._costs, 0.0)  # of the cell's time, done
         self._state: dict[str, str] = {}  # of what runs now
@@ -93,7 +94,7 @@ class Display:
     def progress(self, key: str, stage: str, done: int, total: int) -> None:
         """Show how far a cell is in a stage."""
         kind = STAGES[stage]
-        self._shares[key] = share_done(CELL_STAGES, self._works[key], kind, done / max(total, 1))
+        self._shares[key] = share_done(self._stages, self._works[key], kind, done / max(total, 1))
         self._resumed.setdefault(key, self._shares[key] if done > 1 else 0.0)
         self._state[key] = f"{kind.activity}, {kind.unit} {done:,}/{total:,}" if total > 1 else kind.activity
         self.tick()

@@ -30,13 +30,20 @@ class Commands(NamedTuple):
 class Actor(Protocol):
     """Drives `drivers` egos at once, each in a town of its own.
 
-    `commands` may raise whatever it likes, and return NaN: the rollout says where. Where `sees` is false, no view is
-    painted. `name` is for people.
+    `commands` may raise whatever it likes, and return NaN: the rollout says where.
     """
 
-    name: str
-    drivers: int
-    sees: bool
+    @property
+    def name(self) -> str:
+        """Return a name for people."""
+
+    @property
+    def drivers(self) -> int:
+        """Return how many egos it drives."""
+
+    @property
+    def sees(self) -> bool:
+        """Return whether it looks at the bird view; where not, none is painted."""
 
     def commands(self, seen: Observations) -> Commands | None:
         """Return the commands of all drivers; None leaves the egos to the expert."""

@@ -32,3 +32,13 @@ def held_out_drives(
     first = settings.recording.seed + (UNSEEN_TOWNS if unseen_towns else STUDY_TOWN)
     town = settings.recording.seed
     return tuple(Drive(seed, seed if unseen_towns else town, duration) for seed in range(first, first + count))
+
+
+def planned_drives(settings: StudySettings) -> list[tuple[str, Drive]]:
+    """Return the drives of every cell of a study with their place, "town" or "unseen"."""
+    driving = settings.driving
+    return [
+        (place, drive)
+        for place, count in (("town", driving.drives), ("unseen", driving.unseen_towns))
+        for drive in held_out_drives(settings, count, driving.duration, unseen_towns=place == "unseen")
+    ]

@@ -48,8 +48,9 @@ def _interleave_blocks(images: Tensor, weight: Tensor, channels: int) -> Tensor:
     """
     kernels = functional.pad(_sub_kernels(weight), (0, 0, 0, 0, 0, 0, 0, -4 * channels % CHANNEL_BLOCK))
     blocks = functional.conv2d(images, kernels, padding=1)[:, : 4 * channels]
-    corners = blocks.unflatten(1, (2, 2, channels))  # [B, 2, 2, D, H + 1, W + 1]
-    return corners.permute(0, 3, 4, 1, 5, 2).flatten(4, 5).flatten(2, 3)
+    count, _, rows, columns = blocks.shape
+    corners = blocks.reshape(count, 2, 2, channels, rows, columns).permute(0, 3, 4, 1, 5, 2)
+    return corners.reshape(count, channels, 2 * rows, 2 * columns)
 
 
 def _sub_kernels(weight: Tensor) -> Tensor:

@@ -20,7 +20,8 @@ class SweepRecord:
 
     `provenance`: commit, uncommitted diff, versions, machine; `data`: the frame store's manifest; `variants`: sweeps
     that differ in one setting only, by its name; `run_id`: of its run in MLflow; `unread`: what of all this could not
-    be read and is left out, and why; `lost`: which of the cells are finished and cannot be read.
+    be read and is left out, and why; `lost`: which of the cells are finished and cannot be read; `drives`: those of
+    the cells whose policies have driven in closed loop (`study.results.drives`).
     """
 
     grid: Grid
@@ -35,6 +36,7 @@ class SweepRecord:
     run_id: str = ""
     unread: tuple[str, ...] = ()
     lost: tuple[str, ...] = ()
+    drives: dict[str, pd.DataFrame] = field(default_factory=dict)
 
     @property
     def complete(self) -> bool:

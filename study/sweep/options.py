@@ -17,7 +17,7 @@ from study.engine.cluster_options import check_cluster
 from study.errors import BadInputError
 from study.sweep.plan import Plan, make_plan
 
-GRID_OPTIONS = ("heads", "fractions", "encoder_seeds", "policy_seeds", "reference", "baselines")
+GRID_OPTIONS = ("heads", "fractions", "encoder_seeds", "policy_seeds", "reference", "baselines", "drive")
 
 
 def _plan(name: str, profile: str, data: Path | None, **values: Any) -> Plan:

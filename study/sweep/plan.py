@@ -72,6 +72,13 @@ class Plan:
         return {key: cell_cost(self.settings, cell, self.grid.policy_seeds) for key, cell in self.cells.items()}
 
     @property
+    def drivers(self) -> list[str]:
+        """Return the cells whose policies should drive in closed loop; on imported drives there is no town for it."""
+        if not self.grid.drive or self.imported:
+            return []
+        return [key for key, cell in self.cells.items() if not cell.baseline or cell.baseline.driving]
+
+    @property
     def works(self) -> dict[str, Work]:
         """Return what the keys and costs of each cell's stages follow from."""
         return {key: Work(self.settings, cell, self.grid.policy_seeds) for key, cell in self.cells.items()}

@@ -31,6 +31,7 @@ from study.errors import EXIT_FAILED, BadInputError, masked
 from study.report.build import publish
 from study.stages import DESCRIBE, Batch, Flow, Task
 from study.sweep.committing import Committing, store_folder
+from study.sweep.driving import drive_cells, undriven
 from study.sweep.options import RunOptions
 from study.sweep.plan import Plan, plan_display
 from study.tracking.tracker import Tracker
@@ -67,16 +68,30 @@ def write_report(plan: Plan, tracker: Tracker) -> int:
 
 
 def run_cells(plan: Plan, options: RunOptions, tracker: Tracker, origin: dict[str, Any]) -> dict[str, str]:
-    """Train what is not finished, until every cell is finished or has failed. Returns the failed, with reasons."""
+    """Train what is not finished, and have its policies drive, until every cell is finished or has failed.
+
+    Returns the failed, with reasons.
+    """
     done = tracker.reader.finished(list(plan.cells))
     given_up = {} if options.retry_failed else tracker.reader.given_up(set(plan.cells) - set(done))
     waiting = [key for key in plan.cells if key not in done and key not in given_up]
+    at_work = waiting or undriven(plan, tracker.reader)
+    with temporary_folder(plan.workspace), start_engine(plan, options) if at_work else InlineEngine() as engine:
+        failed = _train(plan, options, tracker, engine, origin, waiting, given_up)
+        return failed | drive_cells(plan, options, tracker, engine)
+
+
+def _train(
+    plan: Plan,
+    options: RunOptions,
+    tracker: Tracker,
+    engine: DaskEngine | InlineEngine,
+    origin: dict[str, Any],
+    waiting: list[str],
+    given_up: dict[str, str],
+) -> dict[str, str]:
     order = sorted(waiting, key=lambda key: -plan.costs[key].seconds)
-    with (
-        plan_display(plan, waiting, given_up) as display,
-        temporary_folder(plan.workspace),
-        start_engine(plan, options) if waiting else InlineEngine() as engine,
-    ):
+    with plan_display(plan, waiting, given_up) as display:
         if waiting:
             data, card = run_flow(_data_flow(plan, engine), engine, display.data)
         else:

@@ -155,6 +155,7 @@ def show_status(plan: Plan, tracking: str, *, as_json: bool) -> int:
         now = time.time()
         attempts = heard_again(attempts, reader.attempts(plan.cells), now)
         cells = cell_statuses(plan, attempts, now)
+    driven = reader.driven(plan.settings, plan.drivers) if reader else {}
     left = seconds_left(plan, cells, now, frames_ready=plan.frames_ready)
     if as_json:
         facts = {
@@ -162,18 +163,21 @@ def show_status(plan: Plan, tracking: str, *, as_json: bool) -> int:
             "profile": plan.profile,
             "tracking": masked(tracking),
             "cells": [dataclasses.asdict(cell) for cell in cells],
+            "driven": sorted(driven),
             "seconds_left": round(left, 1),
         }
         print(json.dumps(facts))
     else:
-        _show(plan, cells, left, now)
+        _show(plan, cells, left, now, len(driven))
     return 0
 
 
-def _show(plan: Plan, cells: Sequence[CellStatus], left: float, now: float) -> None:
+def _show(plan: Plan, cells: Sequence[CellStatus], left: float, now: float, driven: int) -> None:
     counts = Counter(cell.state for cell in cells)
     parts = [f"{counts[state]} {state}" for state in STATES if state != "finished" and counts[state]]
     parts = [f"{plan.grid.name} ({plan.profile}): {counts['finished']} of {len(cells)} cells finished", *parts]
+    if driven < len(plan.drivers):
+        parts.append(f"{driven} of {len(plan.drivers)} have driven")
     if left:
         parts.append(f"about {duration_text(left)} left")
     print(", ".join(parts))

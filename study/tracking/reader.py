@@ -7,12 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import PurePosixPath
 from typing import Any, Self
 
+import pandas as pd
 from mlflow.entities import Run
 
 from study.atomic import scratch_folder
 from study.config.grid import Cell, Grid
+from study.config.keys import drive_key
 from study.config.settings import StudySettings
 from study.config.workspace import HERE
 from study.errors import BadInputError, masked
@@ -22,6 +25,8 @@ from study.tracking.experiment import Experiment, TrackerLostError, UnreadableEr
 
 PLAN_VERSION = 1
 RESULT = "result"  # artifact folder of a cell run
+DRIVES = PurePosixPath("drives/drives.parquet")  # artifact of a cell run whose policies have driven
+DRIVE_KEY = "drive_key"  # its tag, written last
 SWEEP_FILES = ("plan.json", "data.json", "provenance.json", "uncommitted.diff")  # artifacts of a sweep run
 PERMANENT = "permanent"  # tag of a failed attempt: another try would not help
 
@@ -104,6 +109,24 @@ class Reader:
             )
         return result
 
+    def driven(self, settings: StudySettings, keys: Collection[str]) -> dict[str, str]:
+        """Return key -> run id of the finished cells whose policies have driven as these settings say."""
+        runs = self.finished_runs(keys)
+        return {
+            key: str(run.info.run_id)
+            for key, run in runs.items()
+            if run.data.tags.get(DRIVE_KEY) == drive_key(settings, key)
+        }
+
+    def load_drives(self, run_id: str) -> pd.DataFrame:
+        """Return the drives that a cell's run holds. Raises UnreadableError when they are missing or damaged."""
+        with self.experiment.guard(), scratch_folder() as folder:
+            try:
+                return pd.read_parquet(self.experiment.download(run_id, str(DRIVES), folder))
+            except (OSError, ValueError) as error:
+                problem = str(error).replace(f"{folder}/", "")
+        raise UnreadableError(f"{DRIVES} of run {run_id} in {self.experiment.uri} cannot be read: {problem}")
+
     def sweep_runs(self) -> list[Run]:
         """Return the sweep runs, the latest opened last."""
         with self.experiment.guard():
@@ -173,6 +196,12 @@ class Reader:
                 failed[key] = f"its result cannot be read: {error}"
                 unread.append(f"{planned[key].label}: {error}")
                 lost.append(key)
+        drives: dict[str, pd.DataFrame] = {}
+        for key, run in self.driven(settings, list(results)).items():
+            try:
+                drives[key] = self.load_drives(run)
+            except UnreadableError as error:
+                unread.append(f"drives of {planned[key].label}: {error}")
         return SweepRecord(
             grid,
             profile,
@@ -185,6 +214,7 @@ class Reader:
             run_id=run_id,
             unread=tuple(unread),
             lost=tuple(lost),
+            drives=drives,
         )
 
     def _missing(self, run_id: str) -> list[str]:

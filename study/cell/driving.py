@@ -1,0 +1,82 @@
+"""The stage that drives: a cell's policies in held-out traffic, and the expert in the same drives."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import asdict, replace
+from typing import Any
+
+import pandas as pd
+import torch
+
+from study.cell.job import CellJob
+from study.cell.stages import Reporter, begin
+from study.config.settings import StudySettings
+from study.driving.actors import Actor, Expert
+from study.driving.cell_actor import cell_actor
+from study.driving.drives import Drive
+from study.driving.metrics import progress, score_drive
+from study.driving.rollout import rollout
+from study.episode.schema import Episode
+from study.products import Product
+from study.results.cell_result import CellResult
+from study.results.drives import EXPERT, WAY
+
+Drives = list[tuple[str, Drive]]
+
+
+def drive_expert(settings: StudySettings, drives: Drives, report: Reporter) -> Product:
+    """Return the expert's drives, one row each, with the way that it makes [m], the length of the others' routes."""
+    return _drive(Expert(), drives, settings, {}, [EXPERT], report)
+
+
+def drive_policies(
+    job: CellJob, result: CellResult, drives: Drives, ways: dict[int, float], report: Reporter
+) -> Product:
+    """Return the drives of a cell's policies, one row for each policy and drive. `ways`: the expert's, by drive."""
+    if job.cell.baseline:  # it looks into the frames that it was made from
+        begin(job, report)
+        result = _first_policies(result, job.settings.driving.baseline_policies)
+    torch.set_num_threads(job.threads)
+    actor = cell_actor(result, job.frames, job.drives, job.products)
+    return _drive(actor, drives, job.settings, ways, range(actor.drivers), report)
+
+
+def _first_policies(result: CellResult, count: int) -> CellResult:
+    """Return a result with its first policies only."""
+    weights = {
+        name: value[:count] if name.startswith(("steering", "acceleration")) else value
+        for name, value in result.policies.items()
+    }
+    return replace(result, policies=weights)
+
+
+def _drive(
+    actor: Actor,
+    drives: Drives,
+    settings: StudySettings,
+    ways: dict[int, float],
+    seeds: Collection[int],
+    report: Reporter,
+) -> Product:
+    started = time.perf_counter()
+    rows: list[dict[str, Any]] = []
+    for done, (place, drive) in enumerate(drives):
+        report("progress", done, len(drives))
+        episodes = rollout(drive, actor, settings, crop=settings.driving.crop)
+        rows += _rows(place, drive, zip(seeds, episodes, strict=True), ways)
+    report("progress", len(drives), len(drives))
+    facts = {"seconds": time.perf_counter() - started, "steps": int(sum(row["time"] for row in rows) * 10)}
+    return Product({}, pd.DataFrame(rows), facts)
+
+
+def _rows(
+    place: str, drive: Drive, driven: Iterable[tuple[int, Episode]], ways: dict[int, float]
+) -> Iterator[dict[str, Any]]:
+    """Yield the row of each policy's drive; without the expert's way, the drive's own is the route's length."""
+    for seed, episode in driven:
+        way = ways.get(drive.seed, progress(episode))
+        facts = episode.source["drive"]
+        where = {"policy_seed": seed, "place": place, "drive": drive.seed, WAY: way}
+        yield where | {"ended": facts["ended"], "reason": facts["reason"]} | asdict(score_drive(episode, way))
