@@ -21,6 +21,7 @@ recording: {warm_up: 1, duration: 6, encoder_episodes: 2, policy_episodes: 2}
 frames: {encoder: 40, policy: 40}
 encoder: {epochs: 3, batch: 16}
 policy: {epochs: 5, batch: 16}
+driving: {drives: 2, unseen_towns: 0, duration: 1, baseline_policies: 2}
 """
 TINY_SWEEP = ("heads", "--profile", "tiny", "--policy_seeds", "2")
 FOUR_CELLS = (*TINY_SWEEP, "--baselines", "[]", "--workers", "2")
