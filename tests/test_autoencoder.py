@@ -31,7 +31,7 @@ from study.encoder.autoencoder import MultiHeadAutoencoder
 from study.encoder.batches import plan_training
 from study.encoder.inputs import mask_places, unpack
 from study.encoder.latents import choose_samples, encode
-from study.encoder.networks import Decoder, Encoder
+from study.encoder.networks import Decoder, Encoder, convolve_blocks, interleave_blocks
 from study.encoder.training import TrainedEncoder, train_encoder
 from study.engine.flows import run_flow
 from study.errors import BadInputError, TrainingDivergedError
@@ -672,3 +672,21 @@ def test_samples_are_the_same_rich_test_frames_for_every_encoder(frames: Frames)
         "plan_target": (64, 64),
     }
     assert all(value.dtype == np.uint8 for value in samples.values())
+
+
+@pytest.mark.parametrize("channels", [1, 2, 3, 5])
+def test_convolutions_in_blocks_and_their_gradients_are_those_of_torch(channels: int) -> None:
+    torch.manual_seed(channels)
+    images = torch.randn(2, channels, 10, 6, dtype=torch.float64, requires_grad=True)
+    weight = torch.randn(7, channels, 4, 4, dtype=torch.float64, requires_grad=True)
+    bias = torch.randn(7, dtype=torch.float64)
+    inputs = torch.randn(2, 7, 5, 3, dtype=torch.float64, requires_grad=True)
+    back = torch.randn(7, channels, 4, 4, dtype=torch.float64, requires_grad=True)
+    for in_blocks, plain, needed in (
+        (convolve_blocks(images, weight, bias), functional.conv2d(images, weight, bias, 2), (images, weight)),
+        (interleave_blocks(inputs, back, channels), functional.conv_transpose2d(inputs, back, None, 2), (inputs, back)),
+    ):
+        torch.testing.assert_close(in_blocks, plain, rtol=0, atol=1e-12)
+        upstream = torch.randn_like(plain)
+        gradients = [torch.autograd.grad(output, needed, upstream) for output in (in_blocks, plain)]
+        torch.testing.assert_close(*gradients, rtol=0, atol=1e-11)

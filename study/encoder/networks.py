@@ -26,10 +26,10 @@ class _Convolution(nn.Conv2d):
         assert self.bias is not None
         if input.device.type == "cpu" or self.in_channels >= CHANNEL_BLOCK:
             return functional.conv2d(input, self.weight, self.bias.detach(), self.stride)
-        return _convolve_blocks(input, self.weight, self.bias.detach())
+        return convolve_blocks(input, self.weight, self.bias.detach())
 
 
-def _convolve_blocks(images: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+def convolve_blocks(images: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     """Return the convolution, kernel 4 and stride 2, of images with even sides, as one with kernel 2 and stride 1.
 
     Blocks of 2x2 pixels become one pixel with four times the channels. A GPU's matrix units want channels by the
@@ -41,10 +41,10 @@ def _convolve_blocks(images: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     return functional.conv2d(blocks, kernels, bias)
 
 
-def _interleave_blocks(images: Tensor, weight: Tensor, channels: int) -> Tensor:
+def interleave_blocks(images: Tensor, weight: Tensor, channels: int) -> Tensor:
     """Return the transposed convolution, kernel 4 and stride 2, as one with kernel 2 to four times the channels.
 
-    See `_SubPixel`, and `_convolve_blocks` for the channels of zeros.
+    See `_SubPixel`, and `convolve_blocks` for the channels of zeros.
     """
     kernels = functional.pad(_sub_kernels(weight), (0, 0, 0, 0, 0, 0, 0, -4 * channels % CHANNEL_BLOCK))
     blocks = functional.conv2d(images, kernels, padding=1)[:, : 4 * channels]
@@ -102,7 +102,7 @@ def _transposed(layer: nn.ConvTranspose2d, images: Tensor, bias: Tensor) -> Tens
         )
         return output
     if layer.out_channels < CHANNEL_BLOCK and not extra:
-        return _interleave_blocks(images, layer.weight, layer.out_channels) + bias.view(-1, 1, 1)
+        return interleave_blocks(images, layer.weight, layer.out_channels) + bias.view(-1, 1, 1)
     return functional.conv_transpose2d(images, layer.weight, bias, STRIDE, output_padding=extra)
 
 
