@@ -192,6 +192,15 @@ def test_the_expert_drives_without_fault(unseen_towns: bool) -> None:
         assert 0.5 < scores.comfort <= 1
 
 
+def test_one_policy_drives_as_it_does_among_the_others(policies: PolicyActor) -> None:
+    among = rollout(DRIVE, policies, SETTINGS)
+    for driver in (0, 2):
+        (alone,) = rollout(DRIVE, policies, SETTINGS, only=[driver])
+        assert drive_of(alone) == drive_of(among[driver])
+        for name in ("x", "y", "steering", "acceleration"):
+            np.testing.assert_array_equal(getattr(alone, name), getattr(among[driver], name))
+
+
 def test_a_still_actor_is_blocked() -> None:
     scores = scores_of(FunctionActor(still), dataclasses.replace(DRIVE, duration=60.0))
     assert scores.blocked == 1

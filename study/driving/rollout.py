@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from functools import cache
 
 import numpy as np
@@ -22,8 +23,17 @@ class ActorError(BadInputError):
     """An actor that raised; the message says where."""
 
 
-def rollout(drive: Drive, actor: Actor, settings: StudySettings, *, crop: float = STEERING_CROP) -> list[Episode]:
+def rollout(
+    drive: Drive,
+    actor: Actor,
+    settings: StudySettings,
+    *,
+    crop: float = STEERING_CROP,
+    only: Collection[int] | None = None,
+) -> list[Episode]:
     """Return a drive as each of the actor's drivers has driven it, at 10 Hz, all side by side in copies of the town.
+
+    With `only`, some of the drivers drive, as they do among the others: the actor decides for all in any case.
 
     An Episode's `source["drive"]` has the ego's agent number, the step at which the actor took over, and what ended the
     drive: "time", "collision", "off route", "blocked", or "failure" with its reason. Equal arguments give equal bits.
@@ -35,6 +45,9 @@ def rollout(drive: Drive, actor: Actor, settings: StudySettings, *, crop: float 
     if actor.sees:
         first.paint_map()
     rides = [first, *(first.copy() for _ in range(actor.drivers - 1))]
+    chosen = range(len(rides)) if only is None else sorted(only)
+    for driver in set(range(len(rides))).difference(chosen):
+        rides[driver].ended = "left out"
     seen = _nothing(rides)
     while any(not ride.ended for ride in rides):
         for place, ride in enumerate(rides):
@@ -45,7 +58,7 @@ def rollout(drive: Drive, actor: Actor, settings: StudySettings, *, crop: float 
                 if actor.sees:
                     seen.image[place] = ride.view()
         _step(rides, actor, seen)
-    return [ride.episode(actor.name, driver) for driver, ride in enumerate(rides)]
+    return [rides[driver].episode(actor.name, driver) for driver in chosen]
 
 
 def _step(rides: list[Ride], actor: Actor, seen: Observations) -> None:
