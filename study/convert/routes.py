@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,3 +77,81 @@ def add_progress(
         light[at[ahead]] = lights[following[ahead]]
         distance[at[ahead]] = lines[following[ahead]] - along[ahead]
     rows |= {"route_s": progress, "light": light, "light_distance": distance}
+
+
+NEAR = 4.0  # a vehicle is on a lane whose centre is nearer than this [m]
+TURNED = np.pi / 3  # and whose direction differs by less than this [rad]
+SWITCH = 15.0  # cost of going to a lane that does not follow, in squared metres
+PICKED = 0.5  # way between moments at which lanes are looked for [s]
+
+
+class LaneMap:
+    """Centre lines of lanes, to find on which of them vehicles drive; `onward` lists the lanes that follow each."""
+
+    def __init__(self, centres: Sequence[Points], onward: Sequence[Sequence[int]]) -> None:
+        self.centres, self.onward = centres, [set(lanes) for lanes in onward]
+        lines = [_dense(line) for line in centres]
+        self._points = np.concatenate([*lines, np.empty((0, 2))])
+        directions = [np.arctan2(*np.gradient(line, axis=0).T[::-1]) for line in lines]
+        self._direction = np.concatenate([*directions, np.empty(0)])
+        self._lane = np.repeat(np.arange(len(lines)), [len(line) for line in lines])
+
+    def visits(self, places: Points, headings: NDArray[np.float64]) -> list[int]:
+        """Return the lanes that a vehicle drove on one after the other; of lanes side by side, the last."""
+        best: dict[int, tuple[float, list[int]]] = {}
+        for place, heading in zip(places, headings, strict=True):
+            here = self._candidates(place, heading)
+            if not here:
+                continue
+            following: dict[int, tuple[float, list[int]]] = {}
+            for lane, cost in here.items():
+                options = [(total + self._step(way[-1], lane), way) for total, way in best.values()]
+                total, way = min(options, key=lambda option: option[0], default=(0.0, []))
+                following[lane] = total + cost, way if way[-1:] == [lane] else [*way, lane]
+            best = following
+        way = min(best.values(), key=lambda option: option[0], default=(0.0, []))[1]
+        return [
+            lane for lane, after in zip(way, [*way[1:], -1], strict=True) if after < 0 or after in self.onward[lane]
+        ]
+
+    def _step(self, lane: int, to: int) -> float:
+        return 0.0 if to == lane or to in self.onward[lane] else SWITCH
+
+    def _candidates(self, place: Points, heading: float) -> dict[int, float]:
+        """Return the squared distance to each lane that the vehicle may be on."""
+        box = np.flatnonzero((np.abs(self._points - place) < NEAR).all(axis=1))
+        turned = np.abs(np.mod(self._direction[box] - heading + np.pi, 2 * np.pi) - np.pi)
+        box = box[turned < TURNED]
+        squares = ((self._points[box] - place) ** 2).sum(axis=1)
+        lanes: dict[int, float] = {}
+        for lane, square in zip(self._lane[box].tolist(), squares.tolist(), strict=True):
+            lanes[lane] = min(square, lanes.get(lane, np.inf))
+        return lanes
+
+
+def _dense(line: Points) -> Points:
+    """Return points of a polyline about a metre apart."""
+    along = np.concatenate([[0.0], np.hypot(*np.diff(line, axis=0).T).cumsum()])
+    at = np.linspace(0, along[-1], max(2, int(along[-1]) + 1))
+    return np.stack([np.interp(at, along, line[:, axis]) for axis in (0, 1)], axis=1)
+
+
+def find_routes(
+    rows: Rows, agents: int, rate: float, lanes: LaneMap, lights: Mapping[int, Sequence[int]]
+) -> list[Points]:
+    """Add progress and lights to rows, and return the way of each vehicle over the lanes that it took.
+
+    `lights` are the lights at the end of lanes; of several, the first governs.
+    """
+    routes: list[Points] = []
+    stops: list[list[tuple[float, int]]] = []
+    order = np.lexsort((rows["step"], rows["agent"]))
+    edges = np.searchsorted(rows["agent"][order], np.arange(agents + 1))
+    for agent in range(agents):
+        at = order[edges[agent] : edges[agent + 1]][:: max(1, round(PICKED * rate))]
+        visits = lanes.visits(np.stack([rows["x"][at], rows["y"][at]], axis=1), rows["heading"][at])
+        route, ends = chain([lanes.centres[lane] for lane in visits])
+        routes.append(route)
+        stops.append([(end, lights[lane][0]) for lane, end in zip(visits, ends, strict=True) if lights.get(lane)])
+    add_progress(rows, agents, routes, stops)
+    return routes

@@ -126,6 +126,11 @@ def _sumo() -> None:
     """Run scenarios of Eclipse SUMO, or read the FCD output of a net."""
 
 
+@_converter("commonroad", "SCENARIO.xml...")
+def _commonroad() -> None:
+    """Read scenarios of CommonRoad, XML 2020a."""
+
+
 def main(args: Sequence[str]) -> int:
     """Run the command and return its exit code."""
     return invoke(data, args, "study.data")
