@@ -110,9 +110,9 @@ class LaneMap:
                 following[lane] = total + cost, way if way[-1:] == [lane] else [*way, lane]
             best = following
         way = min(best.values(), key=lambda option: option[0], default=(0.0, []))[1]
-        return [
-            lane for lane, after in zip(way, [*way[1:], -1], strict=True) if after < 0 or after in self.onward[lane]
-        ]
+        later = [*way[1:], None][: len(way)]
+        pairs = zip(way, later, strict=True)
+        return [lane for lane, after in pairs if after is None or after in self.onward[lane]]
 
     def _step(self, lane: int, to: int) -> float:
         return 0.0 if to == lane or to in self.onward[lane] else SWITCH

@@ -131,6 +131,15 @@ def _commonroad() -> None:
     """Read scenarios of CommonRoad, XML 2020a."""
 
 
+@_converter(
+    "highd",
+    "XX_tracks.csv...|FOLDER",
+    click.option("--map", "maps", type=Path, multiple=True, metavar="FILE", help="lanelet2 .osm: one, or one for each"),
+)
+def _highd() -> None:
+    """Read recordings in the CSV layout of highD, inD, rounD and exiD."""
+
+
 def main(args: Sequence[str]) -> int:
     """Run the command and return its exit code."""
     return invoke(data, args, "study.data")
