@@ -5,16 +5,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pypdf import PdfReader
 
 from study.convert.sumo import convert
 from study.convert.sumo_net import read_net
 from study.convert.sumo_trace import read_fcd
 from study.data.__main__ import main
 from study.episode.files import read_episode
-from study.episode.importing import check_drives
+from study.episode.importing import check_drives, import_drives
 from study.episode.schema import GREEN, RED, YELLOW
 from study.errors import BadInputError
+from tests.support.processes import sweep
 from tests.support.sumo import NET, SPEED, write_fcd, write_net
+from tests.support.sweeps import working_folder
 
 
 @pytest.fixture
@@ -81,6 +84,8 @@ def test_a_long_recording_is_cut(tmp_path):
     parts = [read_episode(path) for path in sorted((tmp_path / "out").iterdir())]
     assert [part.steps for part in parts] == [50] * 4
     assert parts[1].light_state[10, 0] == GREEN
+    imported = import_drives(tmp_path / "out", tmp_path / "imported")
+    assert {drive.recording for drive in imported.drives} == {"fcd"}, "they share vehicles, so they stay together"
 
 
 def test_types_and_routes_come_from_the_demand(tmp_path):
@@ -295,3 +300,15 @@ def test_a_scenario_that_sumo_refuses_is_bad_input(scenario, tmp_path):
     with pytest.raises(BadInputError, match=r"SUMO cannot run it .*no.rou.xml"):
         convert([tmp_path / "bad.sumocfg"], tmp_path / "out", 60.0)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.stress
+def test_a_converted_scenario_ends_in_a_report(scenario, tmp_path):
+    working_folder(tmp_path)
+    seen = ("--drives", "6", "--warm-up", "30", "--seconds", "40")
+    main(["convert", "sumo", str(scenario / "g.sumocfg"), *seen, "--out", str(tmp_path / "drives")])
+    main(["import", str(tmp_path / "drives"), "--out", str(tmp_path / "mine")])
+    completed = sweep(tmp_path, "heads", "--profile", "smoke", "--data", "mine")
+    assert completed.returncode == 0, completed.stderr
+    text = "".join(page.extract_text() for page in PdfReader(tmp_path / "reports/heads.pdf").pages)
+    assert "study convert sumo" in text

@@ -57,7 +57,9 @@ def _parts(recording: Recording, cut: float) -> Iterator[Recording]:
     for number, (first, last) in enumerate(pairwise(edges)):
         part = recording.part(first, last)
         if any(agent.ego for agent in part.agents):
-            yield dataclasses.replace(part, id=recording.id if count == 1 else f"{recording.id}-{number:03d}")
+            source = part.source | ({"recording": recording.id} if count > 1 else {})  # its parts stay in one set
+            name = recording.id if count == 1 else f"{recording.id}-{number:03d}"
+            yield dataclasses.replace(part, id=name, source=source)
 
 
 def as_recording(

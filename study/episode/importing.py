@@ -115,12 +115,21 @@ def _import_recording(name: str, recording: Recording, findings: Findings, draft
     if findings.errors:
         lost = {"rows": findings.rows, "values": findings.values, "findings": len(findings.errors)}
         recording = dataclasses.replace(recording, source=recording.source | {"left_out": lost})
+    origin = _origin(name, recording)
     for number, part in enumerate(recording.parts()):
         whole = part is recording
         adapted = adapt(part.episode(), str(findings.folder))
         if not whole and not adapted.egos:
             continue
-        yield _write_drive(name if whole else f"{name}-part-{number:03d}", name, adapted, draft)
+        yield _write_drive(name if whole else f"{name}-part-{number:03d}", origin, adapted, draft)
+
+
+def _origin(name: str, recording: Recording) -> str:
+    """Return the name of the recording that a drive was cut from, by its writer's word; else the drive's own."""
+    cut_from = recording.source.get("recording")
+    if isinstance(cut_from, str) and name.endswith(recording.id):
+        return name.removesuffix(recording.id) + cut_from
+    return name
 
 
 def _write_drive(name: str, recording: str, adapted: Adapted, draft: Path) -> Drive:

@@ -5,7 +5,8 @@ An Episode is a folder of four files. Right-handed coordinates: x east, y north 
 `episode.json`
     schema_version  1
     id              the folder's name for people
-    source          {"writer": ..., ...}: what wrote it, free keys
+    source          {"writer": ..., ...}: what wrote it, free keys; "recording": name of what this drive was cut from,
+                    if from a longer one: such drives share vehicles, and stay in one set
     rate_hz         steps per second
     steps           number of steps T; step k is at k / rate_hz seconds
     labels          "recorded", "derived" (commands estimated from the motion) or "none"
