@@ -58,7 +58,10 @@ def job_of(plan: Plan, key: str, scratch: Path) -> CellJob:
 def drive(settings: StudySettings, job: CellJob, result: CellResult) -> Flow[pd.DataFrame]:
     drives = planned_drives(settings)
     expert = yield from expert_flow(settings, drives, job.products)
-    return (yield from drive_flow(job, result, drives, expert))
+    table, films = yield from drive_flow(job, result, drives, expert)
+    assert films.keys() == {"best.gif", "median.gif", "worst.gif"}
+    assert all(content.startswith(b"GIF8") for content in films.values())
+    return table
 
 
 def test_every_policy_and_the_expert_drive_every_drive(plan: Plan, reader: Reader) -> None:

@@ -13,7 +13,8 @@ import torch
 from study.cell.job import CellJob
 from study.cell.stages import Reporter, begin
 from study.config.settings import StudySettings
-from study.driving.actors import Actor, Expert
+from study.data.film import film
+from study.driving.actors import Actor, Expert, PolicyActor
 from study.driving.cell_actor import cell_actor
 from study.driving.drives import Drive
 from study.driving.metrics import progress, score_drive
@@ -35,12 +36,34 @@ def drive_policies(
     job: CellJob, result: CellResult, drives: Drives, ways: dict[int, float], report: Reporter
 ) -> Product:
     """Return the drives of a cell's policies, one row for each policy and drive. `ways`: the expert's, by drive."""
+    actor = _actor(job, result, report)
+    return _drive(actor, drives, job.settings, ways, range(actor.drivers), report)
+
+
+def film_drives(
+    job: CellJob, result: CellResult, drives: Drives, driven: pd.DataFrame, report: Reporter
+) -> dict[str, bytes]:
+    """Return films of the best, the median and the worst of the drives in the study's town, by driving score."""
+    actor = _actor(job, result, report)
+    rows = driven[(driven["place"] == "town") & (driven["policy_seed"] != EXPERT)]
+    rows = rows.sort_values(["driving_score", "time", "drive", "policy_seed"])
+    by_seed = {drive.seed: drive for _, drive in drives}
+    films = {}
+    for done, (name, place) in enumerate({"worst": 0, "median": len(rows) // 2, "best": len(rows) - 1}.items()):
+        row = rows.iloc[place]
+        drive, policy = by_seed[row["drive"]], int(row["policy_seed"])
+        (episode,) = rollout(drive, actor, job.settings, crop=job.settings.driving.crop, only=[policy])
+        films[f"{name}.gif"] = film(episode, job.settings.birdview, ".gif", row["driving_score"])
+        report("progress", done + 1, 3)
+    return films
+
+
+def _actor(job: CellJob, result: CellResult, report: Reporter) -> PolicyActor:
     if job.cell.baseline:  # it looks into the frames that it was made from
         begin(job, report)
         result = _first_policies(result, job.settings.driving.baseline_policies)
     torch.set_num_threads(job.threads)
-    actor = cell_actor(result, job.frames, job.drives, job.products)
-    return _drive(actor, drives, job.settings, ways, range(actor.drivers), report)
+    return cell_actor(result, job.frames, job.drives, job.products)
 
 
 def _first_policies(result: CellResult, count: int) -> CellResult:

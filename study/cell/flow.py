@@ -68,8 +68,10 @@ def expert_flow(settings: StudySettings, drives: Sequence[Any], products: Path) 
     return pd.concat([product.curves for product in driven], ignore_index=True)
 
 
-def drive_flow(job: CellJob, result: CellResult, drives: Sequence[Any], expert: pd.DataFrame) -> Flow[pd.DataFrame]:
-    """Have the policies of a finished cell drive, and return the drives, the expert's first.
+def drive_flow(
+    job: CellJob, result: CellResult, drives: Sequence[Any], expert: pd.DataFrame
+) -> Flow[tuple[pd.DataFrame, dict[str, bytes]]]:
+    """Have the policies of a finished cell drive; return the drives, the expert's first, and films by file name.
 
     Nothing of the tracker is needed: the weights are those of the result.
     """
@@ -83,7 +85,10 @@ def drive_flow(job: CellJob, result: CellResult, drives: Sequence[Any], expert: 
         for share in shares
     ]
     driven = yield from _keep(folders, (), tasks)
-    return pd.concat([expert, *(product.curves for product in driven)], ignore_index=True)
+    table = pd.concat([expert, *(product.curves for product in driven)], ignore_index=True)
+    filming = Task(DRIVE, f"{DRIVING_MODULE}:film_drives", (job, needed, drives, table), reports=True)
+    (films,) = yield Batch([filming])
+    return table, films
 
 
 def _task(stage: Stage, function: str, *args: Any, weight: int = 1) -> Task:

@@ -64,7 +64,7 @@ class _Driving:
     def _retry(self, key: str, reason: str) -> None:
         self._display.say(f"{self._plan.cells[key].label}: {reason.strip().splitlines()[-1]}; it will be tried again")
 
-    def _next(self) -> tuple[str, Flow[pd.DataFrame]] | None:
+    def _next(self) -> tuple[str, Flow[tuple[pd.DataFrame, dict[str, bytes]]]] | None:
         while self._left:
             key = self._left.pop(0)
             self._display.start(key)
@@ -76,9 +76,9 @@ class _Driving:
                 return key, drive_flow(self._jobs[key], result, self._drives, self._expert)
         return None
 
-    def _finished(self, key: str, table: pd.DataFrame) -> None:
+    def _finished(self, key: str, value: tuple[pd.DataFrame, dict[str, bytes]]) -> None:
         try:
-            commit_drives(self._tracker, self._runs[key], drive_key(self._plan.settings, key), table, {})
+            commit_drives(self._tracker, self._runs[key], drive_key(self._plan.settings, key), *value)
         except BadInputError as error:  # the store is away, or the run was deleted: the drives are kept
             self._give_up(key, str(error))
             return
