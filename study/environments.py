@@ -37,9 +37,9 @@ Action = tuple[int, NDArray[Any]] | NDArray[Any]
 class BirdviewTownEnv(gymnasium.Env[NDArray[Any], Action]):
     """One ego in a town whose other vehicles are the autopilot's and react, at 10 Hz.
 
-    Observation: the ego's bird view [64, 64, 3] uint8, bit for bit what a recorded drive renders to; with `encode`, what
-    that makes of it, [64] float32. Action: (class of acceleration: 0 brake, 1 keep, 2 go; steering [1], positive to the
-    left, in +-`crop`). With `continuous` it is one vector in [-1, 1]: steering as a share of `crop`, and acceleration,
+    Observation: the ego's bird view [64, 64, 3] uint8, bit for bit what a recorded drive renders to; with `encode`,
+    what that makes of it, [64] float32. Action: (class of acceleration: 0 brake, 1 keep, 2 go; steering [1], positive
+    to the left, in +-`crop`). With `continuous` it is one vector in [-1, 1]: steering as a share of `crop`, and acceleration,
     whose thirds are the classes; agents that take vectors only need that.
     Reward: speed as a share of the limit, -1 for a step that ends in a collision or without a command. The episode is
     terminated by a collision, by leaving the route, by standing without cause, and by an action that is none; it is
@@ -180,4 +180,6 @@ def _encoder(cell: str | Path, tracking: str) -> tuple[Arrays, dict[str, Any]]:
         result = reader.load_result(runs[str(cell)])
     if not result.encoder:
         raise BadInputError(f"{result.cell.label}: a baseline has no encoder; choose a cell with heads")
-    return result.encoder, {name: value for name, value in result.settings.items() if name in StudySettings.model_fields}
+    return result.encoder, {
+        name: value for name, value in result.settings.items() if name in StudySettings.model_fields
+    }

@@ -147,7 +147,7 @@ def test_the_picture_shows_the_town_and_what_the_ego_sees() -> None:
 
 
 def test_bad_input_is_one_clear_error(weights: Path, tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match="no finished cell|nothing was tracked"):
+    with pytest.raises(BadInputError, match=r"no finished cell|nothing was tracked"):
         latent_town("0" * 16)
     (tmp_path / "a.safetensors").write_bytes(b"no weights")
     with pytest.raises(BadInputError, match="holds no weights"):
