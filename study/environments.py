@@ -11,6 +11,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 from safetensors import SafetensorError
@@ -20,10 +21,10 @@ from study.config.paper import ACCELERATIONS, IMAGE, LATENT, STEERING_CROP
 from study.config.settings import StudySettings
 from study.config.workspace import HERE
 from study.data.scene import Scene
-from study.driving.actors import image_encoder
 from study.driving.drives import DURATION, Drive
 from study.driving.ride import Ride
-from study.driving.rollout import nothing_seen
+from study.encoder.inputs import to_float
+from study.encoder.networks import encoder_of
 from study.errors import BadInputError
 from study.products import Arrays
 from study.results.cell_result import CellResult
@@ -39,8 +40,8 @@ class BirdviewTownEnv(gymnasium.Env[NDArray[Any], Action]):
 
     Observation: the ego's bird view [64, 64, 3] uint8, bit for bit what a recorded drive renders to; with `encode`,
     what that makes of it, [64] float32. Action: (class of acceleration: 0 brake, 1 keep, 2 go; steering [1], positive
-    to the left, in +-`crop`). With `continuous` it is one vector in [-1, 1]: steering as a share of `crop`, and acceleration,
-    whose thirds are the classes; agents that take vectors only need that.
+    to the left, in +-`crop`). With `continuous` it is one vector in [-1, 1]: steering as a share of `crop`, and
+    acceleration, whose thirds are the classes; agents that take vectors only need that.
     Reward: speed as a share of the limit, -1 for a step that ends in a collision or without a command. The episode is
     terminated by a collision, by leaving the route, by standing without cause, and by an action that is none; it is
     truncated after `duration` [s]. Then the last observation is returned again. `info` has the `speed` [m/s], what the
@@ -110,7 +111,7 @@ class BirdviewTownEnv(gymnasium.Env[NDArray[Any], Action]):
         ride = self._begun()
         step = ride.recorder.step - bool(ride.ended)
         if self._scene is None or self._scene.episode.x is not ride.recorder.arrays["x"]:
-            self._scene = Scene(ride.live(), ride.agent, self.crop, ride.lead_in)
+            self._scene = Scene(ride.live, ride.agent, self.crop, ride.lead_in)
         return self._scene.frame(step, self._view, ride.recorder.step - 1)
 
     def _begun(self) -> Ride:
@@ -148,12 +149,11 @@ def latent_town(cell: str | Path, tracking: str = HERE.tracking, **options: Any)
     on. Raises BadInputError for a cell that is not there.
     """
     weights, settings = _encoder(cell, tracking)
-    encode = image_encoder(weights)
-    seen = nothing_seen(1)
+    encoder = encoder_of(weights)
 
+    @torch.inference_mode()
     def latent(image: Image) -> NDArray[np.float32]:
-        seen.image[0] = image
-        z: NDArray[np.float32] = encode(seen)[0]
+        z: NDArray[np.float32] = encoder(to_float(torch.from_numpy(image[None])))[0].float().numpy()
         return z
 
     return BirdviewTownEnv(**{"settings": settings, **options}, encode=latent)

@@ -7,22 +7,22 @@ python -m study.sweep drive heads --actor my_driver.py:drive --town 12
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import click
-from numpy.typing import NDArray
 
 from study.atomic import write_atomic
 from study.console.interrupts import check_stopped
 from study.console.terminal import print_table
 from study.data.film import check_suffix, film
 from study.data.scene import ENDINGS
-from study.driving.actors import Actor, Commands, Expert, Observations, PolicyActor, image_encoder
+from study.driving.actors import Actor, Commands, Expert
+from study.driving.cell_actor import cell_actor
 from study.driving.drives import Drive, held_out_drives
 from study.driving.metrics import UNITS, DriveScores, progress, score_drive
+from study.driving.observations import Observations
 from study.driving.rollout import ActorError, rollout
 from study.driving.user_function import function_actor, place
 from study.episode.schema import Episode
@@ -97,23 +97,18 @@ def choose_actor(plan: Plan, tracking: str, choice: Choice) -> Actor:
     if not reader or not runs:
         raise BadInputError(f"no cell of {plan.title} is finished; run the sweep first, or give --actor")
     result = reader.load_result(runs[choose({key: plan.cells[key] for key in runs}, choice.cell, 0)])
-    return policy_actor(result, choice.seed)
+    actor = cell_actor(one_policy(result, choice.seed), plan.frames, plan.drives, plan.workspace.data)
+    actor.name = f"{result.cell.label}, policy {choice.seed}"
+    return actor
 
 
-def policy_actor(result: CellResult, seed: int) -> Actor:
-    """Return one policy of a cell. Raises BadInputError when it has no such seed."""
-    if not result.encoder:
-        raise BadInputError(f"{result.cell.label}: a baseline has no encoder; choose a cell with heads")
+def one_policy(result: CellResult, seed: int) -> CellResult:
+    """Return a result with one of its policies. Raises BadInputError when it has no such seed."""
     seeds = len(result.policies["steering_2_bias"])
     if seed not in range(seeds):
         raise one_of(f"policy seed of {result.cell.label}", seed, range(seeds))
-    name = f"{result.cell.label}, policy {seed}"
-    return PolicyActor(name, image_encoder(result.encoder), one_policy(result.policies, seed))
-
-
-def one_policy(policies: Mapping[str, NDArray[Any]], seed: int) -> dict[str, NDArray[Any]]:
-    """Return the weights of one of the policies, with an axis S of length one."""
-    return {name: value if name.startswith("z_") else value[seed : seed + 1] for name, value in policies.items()}
+    policies = {name: value if name[:2] == "z_" else value[seed : seed + 1] for name, value in result.policies.items()}
+    return replace(result, policies=policies)
 
 
 def _rollout(plan: Plan, chosen: Drive, actor: Actor, crop: float) -> Episode:
