@@ -29,7 +29,7 @@ from study.episode.schema import Episode
 from study.errors import BadInputError, one_of
 from study.results.cell_result import CellResult
 from study.sim.dynamics import DT
-from study.sweep.plan import Plan, look_up
+from study.sweep.plan import Plan, cell_jobs, look_up
 from study.sweep.verify import choose
 
 COUNTED = ("count", "0 or 1")  # units of scores without decimals
@@ -97,7 +97,8 @@ def choose_actor(plan: Plan, tracking: str, choice: Choice) -> Actor:
     if not reader or not runs:
         raise BadInputError(f"no cell of {plan.title} is finished; run the sweep first, or give --actor")
     result = reader.load_result(runs[choose({key: plan.cells[key] for key in runs}, choice.cell, 0)])
-    actor = cell_actor(one_policy(result, choice.seed), plan.frames, plan.drives, plan.workspace.data)
+    job = cell_jobs(plan, "cpu", 1)[result.key]
+    actor = cell_actor(one_policy(result, choice.seed), job.frames, job.drives, job.products)
     actor.name = f"{result.cell.label}, policy {choice.seed}"
     return actor
 
