@@ -41,7 +41,7 @@ EGO, WARNING, OTHERS = _colour(BLUE), _colour(VERMILION), _colour(GREY)
 _, AMBER, GREEN, SKY, _ = map(_colour, FRACTION_COLOUR)
 LIGHTS, WORD_OF_LIGHT = (GREEN, AMBER, WARNING), ("green", "yellow", "red")
 LEVELS = dict(zip(ACCELERATIONS, (WARNING, OTHERS, GREEN), strict=True))
-PAGE, KERB, ROAD, LINE, INK = (255,) * 3, (150,) * 3, (222,) * 3, (255,) * 3, (34,) * 3
+PAGE, KERB, ROAD, LINE, INK = map(_colour, ("#FFFFFF", "#969696", "#DEDEDE", "#FFFFFF", "#222222"))
 
 
 class Scene:
