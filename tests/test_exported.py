@@ -127,3 +127,26 @@ def test_the_model_has_its_signature_and_an_example_that_fits(result, model):
     np.testing.assert_allclose(example, result.samples["input"][:1].transpose(0, 3, 1, 2) / 255, atol=6e-5)
     answer = mlflow.pytorch.load_model(str(model))(torch.from_numpy(example))
     assert {name: value.shape for name, value in answer.items()} == {"steering": (3, 1), "acceleration": (3, 1, 3)}
+
+
+def test_the_network_drives_without_what_has_trained_it(file, tmp_path):
+    """The process holds none of the modules that train, and the drive is that of the weights."""
+    code = f"""
+import sys, numpy as np, torch
+from study.config.settings import RecordingSettings, StudySettings, TownSettings
+from study.driving.actors import ExportedActor
+from study.driving.drives import Drive
+from study.driving.rollout import rollout
+town = TownSettings(rows=3, columns=3, dropped_edges=0, vehicles=8)
+settings = StudySettings(town=town, recording=RecordingSettings(warm_up=1.0))
+actor = ExportedActor("exported", torch.export.load({str(file)!r}).module(), {SEEDS})
+episodes = rollout(Drive(2_000_001, 0, 2.0), actor, settings)
+assert len(episodes) == {SEEDS}
+for episode in episodes:
+    facts = episode.source["drive"]
+    assert facts["ended"] != "failure" and episode.steps > facts["first_step"]
+training = ("lightning", "study.encoder.training", "study.policy.training", "mlflow")
+print([name for name in training if name in sys.modules])
+"""
+    completed = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (completed.returncode, completed.stdout.strip()) == (0, "[]"), completed.stderr

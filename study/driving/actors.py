@@ -16,7 +16,7 @@ from study.config.settings import SPEEDS
 from study.driving.driver import Policies
 from study.driving.observations import Encode, Observation, Observations
 from study.encoder.inputs import to_float
-from study.encoder.latents import encoder_of
+from study.encoder.networks import encoder_of
 from study.errors import BadInputError
 
 

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from study.config.paper import LATENT
 from study.encoder.inputs import to_float
-from study.encoder.latents import encoder_of
+from study.encoder.networks import encoder_of
 from study.policy.networks import WIDTHS, through
 from study.results.cell_result import CellResult
 

@@ -80,14 +80,14 @@ class Ride:
     def paint_map(self) -> Renderer:
         """Return the renderer, whose map is painted once for this ride and its copies."""
         if self.renderer is None:
-            self.renderer = Renderer(self._live, self.settings.birdview, ())
+            self.renderer = Renderer(self.live, self.settings.birdview, ())
         return self.renderer
 
     def view(self) -> Image:
         """Return what the ego sees after `observe`, [64, 64, 3] uint8: the bits that its Episode renders to."""
         renderer = self.paint_map()
-        if renderer.episode is not self._live:
-            self.renderer = renderer = renderer.on(self._live)
+        if renderer.episode is not self.live:
+            self.renderer = renderer = renderer.on(self.live)
         images, _ = renderer.render(np.array([[self.recorder.step, self.agent]]))
         return np.asarray(images[0])
 
@@ -104,7 +104,7 @@ class Ride:
     def state(self, limits: Limits) -> Columns:
         """Return what the expert decides by, of the last step that was observed, as `Observations` has it."""
         step = max(self.recorder.step - bool(self.ended), 0)
-        return live_state(self._live, np.array([[step, self.agent]]), self.settings.birdview, limits)
+        return live_state(self.live, np.array([[step, self.agent]]), self.settings.birdview, limits)
 
     def act(self, steering: float, level: float) -> None:
         """Follow a command, the steering cropped; one that is none ends the drive as a failure."""
@@ -166,7 +166,7 @@ class Ride:
         return {"agent": int(self.recorder.seen[-1]["agent"][other]), **poses}
 
     @property
-    def _live(self) -> Episode:
+    def live(self) -> Episode:
         """Return the Episode so far, whose arrays are those that the recorder fills."""
         if self.known is None or self.known.x is not self.recorder.arrays["x"]:
             self.known = self._so_far()

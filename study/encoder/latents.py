@@ -15,8 +15,7 @@ from study.config.paper import LATENT
 from study.data.frames import Frames
 from study.encoder.autoencoder import MultiHeadAutoencoder
 from study.encoder.inputs import Bytes, Indices, mask_places, to_float, unpack
-from study.encoder.networks import Encoder
-from study.errors import BadInputError
+from study.encoder.networks import encoder_of
 from study.products import Arrays
 
 SAMPLES = 16
@@ -50,16 +49,6 @@ def paint_samples(module: MultiHeadAutoencoder, frames: Frames, rows: Indices) -
     for head, target in unpack(masks, mask_places(outputs)).items():
         samples[f"{head}_target"] = target.mul(255).to(torch.uint8).squeeze(1).numpy()
     return samples
-
-
-def encoder_of(weights: Mapping[str, NDArray[Any]]) -> Encoder:
-    """Return the trained network of these weights. Raises BadInputError when they are not an Encoder's."""
-    encoder = Encoder(variational="log_variance.weight" in weights)
-    try:
-        encoder.load_state_dict({name: torch.from_numpy(np.array(value)) for name, value in weights.items()})
-    except (RuntimeError, TypeError) as error:
-        raise BadInputError(f"these are not the weights of an encoder: {error}") from error
-    return encoder.eval()
 
 
 def encode(

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
 from study.config.heads import HEADS
 from study.config.paper import CHANNELS, CORE, IMAGE, KERNEL, LATENT, STRIDE
+from study.errors import BadInputError
 from study.randomness import rng
 
 _CORE_NUMBERS = CHANNELS[-1] * CORE * CORE
@@ -189,3 +193,13 @@ def untrained_encoder(seed: int, *, variational: bool = False) -> Encoder:
 def seeded_generator(seed: int, purpose: str, device: torch.device | str = "cpu") -> torch.Generator:
     """Return torch's generator of one purpose of a seed (see `rng`)."""
     return torch.Generator(device).manual_seed(int(rng(seed, purpose).integers(2**63)))
+
+
+def encoder_of(weights: Mapping[str, NDArray[Any]]) -> Encoder:
+    """Return the trained network of these weights. Raises BadInputError when they are not an Encoder's."""
+    encoder = Encoder(variational="log_variance.weight" in weights)
+    try:
+        encoder.load_state_dict({name: torch.from_numpy(np.array(value)) for name, value in weights.items()})
+    except (RuntimeError, TypeError) as error:
+        raise BadInputError(f"these are not the weights of an encoder: {error}") from error
+    return encoder.eval()

@@ -12,9 +12,11 @@ import signal
 from collections.abc import Sequence
 from pathlib import Path
 from pkgutil import resolve_name  # the work is imported when it begins: --help and --dry-run need none of it
+from typing import Any
 
 import click
 
+from study.config.paper import STEERING_CROP
 from study.console.interrupts import stoppable
 from study.console.options import invoke, run, tracking_option
 from study.errors import BadInputError
@@ -31,6 +33,7 @@ no_report = click.option("--no-report", is_flag=True, help="stop when the cells 
 Further commands, each with its own --help:
   status NAME      what is done, what runs where, what is left
   verify NAME      compute a finished cell again and compare
+  drive NAME       watch a finished cell, or your own function, drive
   train NAME       train where there is no tracker; results become folders
   import NAME DIR  commit the results of train to MLflow
 
@@ -115,7 +118,48 @@ def import_results(command: str, *, plan: Plan, folder: Path, tracking: str, wai
     return stoppable(lambda: import_folder(plan, folder, tracking, wait=wait, report=not no_report), command)
 
 
-COMMANDS = {"status": status, "verify": verify, "train": train, "import": import_results}
+@click.command(
+    epilog="""\b
+Examples:
+  python -m study.sweep drive heads --cell 'rec+plan 100% e0' --seed 3 --town 12 --out drive.mp4
+  python -m study.sweep drive heads --actor expert --crop 0.42
+  python -m study.sweep drive heads --actor my_driver.py:drive --out drive.gif"""
+)
+@click.option("--cell", metavar="CELL", help="label or key of a finished cell, as --dry-run shows them")
+@click.option("--seed", type=click.IntRange(min=0), default=0, metavar="N", help="which policy of the cell [0]")
+@click.option(
+    "--actor",
+    metavar="WHO",
+    help="in the place of a cell: expert, or FILE.py:function, your own function from what is seen (image, speeds, "
+    "last command) to steering and class of acceleration",
+)
+@click.option("--drive", type=click.IntRange(0, 9999), metavar="N", help="held-out drive in the study's town [0]")
+@click.option("--town", type=click.IntRange(0, 9999), metavar="N", help="held-out drive in an unseen town, instead")
+@click.option(
+    "--duration", type=click.FloatRange(0.1, 3600), default=60.0, metavar="S", help="longest time to drive [60 s]"
+)
+@click.option(
+    "--crop",
+    type=click.FloatRange(min=0, min_open=True),
+    default=STEERING_CROP,
+    metavar="C",
+    help=f"steering is applied up to this label, left and right [{STEERING_CROP}, Sec. IV-C]",
+)
+@click.option("--out", type=Path, metavar="FILE", help="film: .mp4, .webm (for browsers) or .gif [none]")
+@tracking_option()
+@options.plan_options()
+@click.pass_obj
+def drive(command: str, *, plan: Plan, tracking: str, out: Path | None, **choice: Any) -> int:
+    """Watch one policy of a finished cell of the sweep NAME drive, in traffic that nothing was trained on.
+
+    Prints its scores next to the expert's in the same drive, and what ended it.
+    """
+    module = resolve_name("study.sweep.drive")
+    chosen = module.Choice(**choice)
+    return stoppable(lambda: int(module.drive(plan, tracking, chosen, out)), command)
+
+
+COMMANDS = {"status": status, "verify": verify, "drive": drive, "train": train, "import": import_results}
 
 
 def main(args: Sequence[str]) -> int:
