@@ -100,8 +100,8 @@ class BirdviewTownEnv(gymnasium.Env[NDArray[Any], Action]):
             reward = float(road.vehicles[ride.slot].speed / limit)
         if not ride.ended:
             self._see(ride)
-        truncated = ride.ended == "time"
-        return self._observation, reward, bool(ride.ended) and not truncated, truncated, self._info(ride)
+        ended: str = ride.ended
+        return self._observation, reward, ended not in {"", "time"}, ended == "time", self._info(ride)
 
     def render(self) -> Image | None:
         """Return the town from above beside what the ego sees, and its last command, [336, 512, 3] uint8."""

@@ -95,7 +95,7 @@ def test_dry_run_speaks_json(folder):
         "sweep",
         "profile",
         "cells",
-            "to_drive",
+        "to_drive",
         "policy_seeds",
         "parameters",
         "frames",

@@ -1,19 +1,13 @@
 """study.sweep drive: who drives where, what is printed, and what is refused."""
 
-from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from study.errors import BadInputError
-from study.policy.draws import initial_weights
-from study.policy.latents import normalisation
 from study.sweep.__main__ import main
-from study.sweep.drive import one_policy
 from tests.support.processes import sweep
 from tests.support.sweeps import TINY_PROFILE, TINY_SWEEP, UndisturbedSweep, working_folder
-from tests.support.synthetic_records import simulate
 
 MINE = """
 def slow(seen):
@@ -24,7 +18,7 @@ def broken(seen):
 
 nothing = 1
 """
-SHORT = ("--profile", "tiny", "--duration", "2")
+SHORT = ("--profile", "tiny", "--driving.duration", "2")
 
 
 @pytest.fixture
@@ -61,10 +55,10 @@ def test_the_expert_drives_in_an_unseen_town(folder, capsys):
         (["--actor", "mine.py:broken"], r"raised AttributeError: .*at 0.0 s of drive 2000000 \(.*mine.py, line 6\)"),
         (["--actor", "expert", "--out", "a.avi"], "unknown kind of film '.avi'; choose from .mp4, .webm, .gif"),
         (["--actor", "expert", "--cell", "rec"], "name who drives"),
-        (["--actor", "expert", "--drive", "1", "--town", "1"], "leave one of them out"),
+        (["--actor", "expert", "--traffic", "1", "--town", "1"], "leave one of them out"),
         ([], "name who drives"),
         (["--cell", "rec 100% e0"], "no cell of heads .tiny. is finished"),
-        (["--actor", "expert", "--duration", "0"], "--duration"),
+        (["--actor", "expert", "--driving.duration", "0"], "driving.duration"),
     ],
 )
 def test_bad_input_is_one_clear_error(folder, words, expected):
@@ -83,7 +77,7 @@ def test_a_policy_of_a_finished_cell_drives(undisturbed: UndisturbedSweep, monke
     monkeypatch.chdir(undisturbed.folder)
     assert TINY_PROFILE in (undisturbed.folder / "sweeps/profiles/tiny.yaml").read_text()
     out = tmp_path / "a.mp4"
-    words = ["drive", *TINY_SWEEP, "--baselines", "[]", "--duration", "2"]
+    words = ["drive", *TINY_SWEEP, "--baselines", "[]", "--driving.duration", "2"]
     assert main([*words, "--cell", "rec+plan 100% e0", "--seed", "1", "--out", str(out)]) == 0
     assert "rec+plan 100% e0, policy 1" in capsys.readouterr().out
     assert out.stat().st_size > 1000
@@ -91,14 +85,3 @@ def test_a_policy_of_a_finished_cell_drives(undisturbed: UndisturbedSweep, monke
         main([*words, "--cell", "reck"])
     with pytest.raises(BadInputError, match="unknown policy seed of rec 100% e0 '9'; choose from 0, 1"):
         main([*words, "--cell", "rec 100% e0", "--seed", "9"])
-
-
-def test_one_policy_is_taken_from_among_the_others():
-    draws = [dict(initial_weights(seed)) for seed in range(3)]
-    policies = {name: np.stack([each[name].numpy() for each in draws]) for name in draws[0]}
-    z = np.random.default_rng(0).normal(size=(20, 64)).astype(np.float32)
-    result = replace(next(iter(simulate().results.values())), policies=policies | normalisation(z, "zscore"))
-    one = one_policy(result, 2).policies
-    assert {name: len(value) for name, value in one.items() if name[:2] != "z_"} == dict.fromkeys(draws[0], 1)
-    assert (one["steering_0_weight"][0] == policies["steering_0_weight"][2]).all()
-    assert (one["z_mean"] == result.policies["z_mean"]).all()

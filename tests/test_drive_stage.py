@@ -1,7 +1,6 @@
 """The stage that drives: what a finished sweep has of it, resuming, and cells that cannot."""
 
 import dataclasses
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -147,13 +146,10 @@ def test_without_a_town_or_told_not_to_nobody_drives(plan: Plan) -> None:
     assert dataclasses.replace(plan, grid=grid).drivers == []
 
 
-def test_committing_twice_doubles_nothing(
-    plan: Plan, reader: Reader, key: str, undisturbed: UndisturbedSweep, tmp_path: Path
-) -> None:
-    shutil.copytree(undisturbed.folder / "mlruns", tmp_path / "mlruns")
+def test_committing_twice_doubles_nothing(plan: Plan, reader: Reader, key: str, undisturbed: UndisturbedSweep) -> None:
     run = reader.finished([key])[key]
     table = reader.load_drives(run)
-    tracker = Tracker(f"sqlite:///{tmp_path}/mlruns/mlflow.db")
+    tracker = Tracker(f"sqlite:///{undisturbed.folder}/mlruns/mlflow.db")
     before = tracker.client.get_metric_history(run, "drive/driving_score")
     commit_drives(tracker, run, drive_key(plan.settings, key), table, {})
     assert tracker.client.get_metric_history(run, "drive/driving_score") == before

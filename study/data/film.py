@@ -78,7 +78,7 @@ def pictures(
 
 def _write_video(path: Path, frames: Iterator[Image], rate: float) -> None:
     writer = cv2.VideoWriter(
-        str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*CODECS[path.suffix]), rate, (2 * SIDE, SIDE + WORDS)
+        str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*CODECS[path.suffix]), rate, (2 * SIDE, SIDE + WORDS)
     )
     if not writer.isOpened():
         raise BadInputError(f"this build of OpenCV cannot write {path.suffix} films; name a .gif")

@@ -16,7 +16,6 @@ from typing import Any
 
 import click
 
-from study.config.paper import STEERING_CROP
 from study.console.interrupts import stoppable
 from study.console.options import invoke, run, tracking_option
 from study.errors import BadInputError
@@ -122,7 +121,7 @@ def import_results(command: str, *, plan: Plan, folder: Path, tracking: str, wai
     epilog="""\b
 Examples:
   python -m study.sweep drive heads --cell 'rec+plan 100% e0' --seed 3 --town 12 --out drive.mp4
-  python -m study.sweep drive heads --actor expert --crop 0.42
+  python -m study.sweep drive heads --actor expert --traffic 4 --driving.duration 30
   python -m study.sweep drive heads --actor my_driver.py:drive --out drive.gif"""
 )
 @click.option("--cell", metavar="CELL", help="label or key of a finished cell, as --dry-run shows them")
@@ -133,23 +132,13 @@ Examples:
     help="in the place of a cell: expert, or FILE.py:function, your own function from what is seen (image, speeds, "
     "last command) to steering and class of acceleration",
 )
-@click.option("--drive", type=click.IntRange(0, 9999), metavar="N", help="held-out drive in the study's town [0]")
+@click.option("--traffic", type=click.IntRange(0, 9999), metavar="N", help="held-out drive in the study's town [0]")
 @click.option("--town", type=click.IntRange(0, 9999), metavar="N", help="held-out drive in an unseen town, instead")
-@click.option(
-    "--duration", type=click.FloatRange(0.1, 3600), default=60.0, metavar="S", help="longest time to drive [60 s]"
-)
-@click.option(
-    "--crop",
-    type=click.FloatRange(min=0, min_open=True),
-    default=STEERING_CROP,
-    metavar="C",
-    help=f"steering is applied up to this label, left and right [{STEERING_CROP}, Sec. IV-C]",
-)
 @click.option("--out", type=Path, metavar="FILE", help="film: .mp4, .webm (for browsers) or .gif [none]")
 @tracking_option()
 @options.plan_options()
 @click.pass_obj
-def drive(command: str, *, plan: Plan, tracking: str, out: Path | None, **choice: Any) -> int:
+def drive(command: str, /, *, plan: Plan, tracking: str, out: Path | None, **choice: Any) -> int:
     """Watch one policy of a finished cell of the sweep NAME drive, in traffic that nothing was trained on.
 
     Prints its scores next to the expert's in the same drive, and what ended it.

@@ -7,7 +7,7 @@ python -m study.sweep drive heads --actor my_driver.py:drive --town 12
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,6 @@ from study.driving.rollout import ActorError, rollout
 from study.driving.user_function import function_actor, place
 from study.episode.schema import Episode
 from study.errors import BadInputError, one_of
-from study.results.cell_result import CellResult
 from study.sim.dynamics import DT
 from study.sweep.plan import Plan, cell_jobs, look_up
 from study.sweep.verify import choose
@@ -37,15 +36,13 @@ COUNTED = ("count", "0 or 1")  # units of scores without decimals
 
 @dataclass(frozen=True)
 class Choice:
-    """Who drives which held-out drive: `drive` counts those in the study's town, `town` those in unseen towns."""
+    """Who drives which held-out drive: `traffic` counts those in the study's town, `town` those in unseen towns."""
 
     cell: str | None
     seed: int
     actor: str | None
-    drive: int | None
+    traffic: int | None
     town: int | None
-    duration: float
-    crop: float
 
     def __post_init__(self) -> None:
         if (self.cell is None) == (self.actor is None):
@@ -53,15 +50,15 @@ class Choice:
                 "name who drives: either --cell with the label of a finished cell, as --dry-run shows them, "
                 "or --actor expert or --actor FILE.py:function"
             )
-        if self.drive is not None and self.town is not None:
-            raise BadInputError("--drive is in the study's town and --town in an unseen one; leave one of them out")
+        if self.traffic is not None and self.town is not None:
+            raise BadInputError("--traffic is in the study's town and --town in an unseen one; leave one of them out")
 
 
 class _Watched:
     """An actor whose steps move a progress bar."""
 
     def __init__(self, actor: Actor, bar: Any) -> None:
-        self.name, self.drivers, self.sees, self._actor, self._bar = actor.name, 1, actor.sees, actor, bar
+        self.name, self.drivers, self.sees, self._actor, self._bar = actor.name, actor.drivers, actor.sees, actor, bar
 
     def commands(self, seen: Observations) -> Commands | None:
         """Return the actor's commands."""
@@ -74,11 +71,11 @@ def drive(plan: Plan, tracking: str, choice: Choice, out: Path | None) -> int:
     """Drive, print the scores next to the expert's in the same drive, write the film, and return the exit code."""
     if out:
         check_suffix(out)
-    actor = choose_actor(plan, tracking, choice)
-    number = choice.town if choice.town is not None else choice.drive or 0
-    chosen = held_out_drives(plan.settings, number + 1, choice.duration, unseen_towns=choice.town is not None)[number]
-    expert = _rollout(plan, chosen, Expert(), choice.crop)
-    episode = expert if isinstance(actor, Expert) else _rollout(plan, chosen, actor, choice.crop)
+    actor, seconds = choose_actor(plan, tracking, choice), plan.settings.driving.duration
+    number = choice.town if choice.town is not None else choice.traffic or 0
+    chosen = held_out_drives(plan.settings, number + 1, seconds, unseen_towns=choice.town is not None)[number]
+    expert = _rollout(plan, chosen, Expert(), 0)
+    episode = expert if isinstance(actor, Expert) else _rollout(plan, chosen, actor, choice.seed if choice.cell else 0)
     best, scores = (score_drive(each, progress(expert)) for each in (expert, episode))
     print_table(*_table(actor.name, scores, best))
     print(f"\n{ending(episode, scores)}")
@@ -98,35 +95,31 @@ def choose_actor(plan: Plan, tracking: str, choice: Choice) -> Actor:
         raise BadInputError(f"no cell of {plan.title} is finished; run the sweep first, or give --actor")
     result = reader.load_result(runs[choose({key: plan.cells[key] for key in runs}, choice.cell, 0)])
     job = cell_jobs(plan, "cpu", 1)[result.key]
-    actor = cell_actor(one_policy(result, choice.seed), job.frames, job.drives, job.products)
+    seeds = len(result.policies["steering_2_bias"])
+    if choice.seed not in range(seeds):
+        raise one_of(f"policy seed of {result.cell.label}", choice.seed, range(seeds))
+    actor = cell_actor(result, job.frames, job.drives, job.products)
     actor.name = f"{result.cell.label}, policy {choice.seed}"
     return actor
 
 
-def one_policy(result: CellResult, seed: int) -> CellResult:
-    """Return a result with one of its policies. Raises BadInputError when it has no such seed."""
-    seeds = len(result.policies["steering_2_bias"])
-    if seed not in range(seeds):
-        raise one_of(f"policy seed of {result.cell.label}", seed, range(seeds))
-    policies = {name: value if name[:2] == "z_" else value[seed : seed + 1] for name, value in result.policies.items()}
-    return replace(result, policies=policies)
-
-
-def _rollout(plan: Plan, chosen: Drive, actor: Actor, crop: float) -> Episode:
+def _rollout(plan: Plan, chosen: Drive, actor: Actor, driver: int) -> Episode:
     steps = round(chosen.duration / DT)
     with click.progressbar(length=steps, label=f"{actor.name} drives", file=sys.stderr) as bar:
         try:
-            (episode,) = rollout(chosen, _Watched(actor, bar), plan.settings, crop=crop)
+            watched, crop = _Watched(actor, bar), plan.settings.driving.crop
+            (episode,) = rollout(chosen, watched, plan.settings, crop=crop, only=[driver])
         except ActorError as error:
             raise BadInputError(f"{error}{place(error.__cause__ or error)}") from error
     return episode
 
 
 def _table(name: str, scores: DriveScores, expert: DriveScores) -> tuple[list[tuple[str, ...]], list[str]]:
-    rows = [("", name, "expert", "")]
+    rows: list[tuple[str, ...]] = [("", name, "expert", "")]
     for score in fields(DriveScores):
         unit = UNITS[score.name]
-        numbers = (f"{getattr(each, score.name):{'.0f' if unit in COUNTED else '.3g'}}" for each in (scores, expert))
+        shape = ".0f" if unit in COUNTED else ".3g"
+        numbers = (f"{getattr(each, score.name):{shape}}" for each in (scores, expert))
         rows.append((score.name.replace("_", " "), *numbers, unit))
     return rows, ["bold", *[""] * (len(rows) - 1)]
 
