@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
-from study.config.paper import ACCELERATIONS, IMAGE, LATENT, STEERING_CROP
+from study.config.paper import ACCELERATIONS, IMAGE, LATENT
 from study.config.settings import StudySettings
 from study.config.workspace import HERE
 from study.data.scene import Scene
-from study.driving.drives import DURATION, Drive
+from study.driving.drives import Drive
 from study.driving.ride import Ride
 from study.encoder.inputs import to_float
 from study.encoder.networks import encoder_of
@@ -40,12 +40,12 @@ class BirdviewTownEnv(gymnasium.Env[NDArray[Any], Action]):
 
     Observation: the ego's bird view [64, 64, 3] uint8, bit for bit what a recorded drive renders to; with `encode`,
     what that makes of it, [64] float32. Action: (class of acceleration: 0 brake, 1 keep, 2 go; steering [1], positive
-    to the left, in +-`crop`). With `continuous` it is one vector in [-1, 1]: steering as a share of `crop`, and
+    to the left, in +-`driving.crop`). With `continuous` it is one vector in [-1, 1]: steering as a share of that, and
     acceleration, whose thirds are the classes; agents that take vectors only need that.
     Reward: speed as a share of the limit, -1 for a step that ends in a collision or without a command. The episode is
     terminated by a collision, by leaving the route, by standing without cause, and by an action that is none; it is
-    truncated after `duration` [s]. Then the last observation is returned again. `info` has the `speed` [m/s], what the
-    `expert` would do (class, steering), and what has `ended` the drive.
+    truncated after `driving.duration` [s]. Then the last observation is returned again. `info` has the `speed` [m/s],
+    what the `expert` would do (class, steering), and what has `ended` the drive.
 
     `reset(seed=N)` draws traffic, lights, ego and route; equal seeds and actions give equal bits. Without a seed the
     next one is drawn. The town is that of `settings.recording.seed`, or drawn from the seed with `town.per_drive`.
@@ -57,15 +57,15 @@ class BirdviewTownEnv(gymnasium.Env[NDArray[Any], Action]):
     def __init__(
         self,
         settings: StudySettings | dict[str, Any] | None = None,
-        duration: float = DURATION,
-        crop: float = STEERING_CROP,
         *,
         continuous: bool = False,
         render_mode: str | None = None,
         encode: Callable[[Image], NDArray[np.float32]] | None = None,
     ) -> None:
         self.settings = StudySettings.model_validate(settings or {})
-        self.duration, self.crop, self.continuous, self.render_mode = duration, crop, continuous, render_mode
+        self.continuous, self.render_mode = continuous, render_mode
+        self.duration, crop = self.settings.driving.duration, self.settings.driving.crop
+        self.crop = crop
         self._encode = encode
         self.observation_space: spaces.Space[Any] = spaces.Box(0, 255, (IMAGE, IMAGE, 3), np.uint8)
         if encode:
@@ -82,7 +82,7 @@ class BirdviewTownEnv(gymnasium.Env[NDArray[Any], Action]):
         """Begin the drive of a seed, at the end of its lead-in."""
         super().reset(seed=seed, options=options)
         drawn = int(self.np_random.integers(2**31)) if seed is None else seed
-        self.ride = Ride(Drive(drawn, self.settings.recording.seed, self.duration), self.settings, self.crop)
+        self.ride = Ride(Drive(drawn, self.settings.recording.seed, self.duration), self.settings)
         self._scene: Scene | None = None
         self._see(self.ride)
         return self._observation, self._info(self.ride)

@@ -9,7 +9,7 @@ import pytest
 from study.analysis.comfort import comfortable
 from study.analysis.proportions import wilson_interval
 from study.config.paper import ACCELERATIONS, STEERING_CROP
-from study.config.settings import BirdviewSettings, RecordingSettings, StudySettings, TownSettings
+from study.config.settings import BirdviewSettings, DrivingSettings, RecordingSettings, StudySettings, TownSettings
 from study.data.birdview import Image, Renderer
 from study.data.prepare import POLICY_SEED
 from study.driving.actors import (
@@ -116,10 +116,10 @@ def test_commands_are_cropped_and_recorded_and_their_speeds_are_seen() -> None:
     (episode,) = rollout(dataclasses.replace(DRIVE, duration=1.5), FunctionActor(hard), SETTINGS)
     check_episode(episode, "here")
     first, ego = drive_of(episode)["first_step"], ego_column(episode)
-    assert episode.steering[first : first + 2, ego].tolist() == [-STEERING_CROP, np.float32(0.1)]
+    assert episode.steering[first : first + 2, ego].tolist() == [np.float32(-SETTINGS.driving.crop), np.float32(0.1)]
     assert (episode.acceleration[first:, ego] == ACCELERATIONS[1]).all()
     assert (seen[3].speeds == episode.speed[first + 3 - np.arange(10), ego]).all()
-    assert (seen[3].steering, seen[3].level) == (-STEERING_CROP, 1)
+    assert (seen[3].steering, seen[3].level) == (np.float32(-SETTINGS.driving.crop), 1)
 
 
 def test_policies_of_a_cell_drive_side_by_side_in_towns_that_are_alike_until_they_act(policies: PolicyActor) -> None:
@@ -221,7 +221,10 @@ def test_a_blind_actor_at_full_throttle_collides_or_runs_reds_or_leaves_its_way(
 def test_the_crop_of_the_paper_is_too_narrow_for_our_turns_and_a_wider_one_is_not() -> None:
     drive = Drive(2_000_000, 0, 20.0)
     settings = SETTINGS.model_copy(update={"town": TownSettings()})
-    narrow, wide = (rollout(drive, Expert(cropped=True), settings, crop=crop)[0] for crop in (STEERING_CROP, 0.42))
+    narrow, wide = (
+        rollout(drive, Expert(cropped=True), settings.model_copy(update={"driving": DrivingSettings(crop=crop)}))[0]
+        for crop in (STEERING_CROP, DrivingSettings().crop)
+    )
     assert drive_of(narrow)["ended"] == "off route"
     assert drive_of(wide)["ended"] == "time"
 

@@ -11,7 +11,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from safetensors.numpy import save_file
 
-from study.config.settings import RecordingSettings, StudySettings, TownSettings
+from study.config.settings import DrivingSettings, RecordingSettings, StudySettings, TownSettings
 from study.data.birdview import Renderer
 from study.encoder.latents import encode
 from study.encoder.networks import untrained_encoder
@@ -19,7 +19,9 @@ from study.environments import BirdviewTownEnv, latent_town
 from study.errors import BadInputError
 
 SETTINGS = StudySettings(
-    town=TownSettings(rows=3, columns=3, dropped_edges=0, vehicles=12), recording=RecordingSettings(warm_up=1.0)
+    town=TownSettings(rows=3, columns=3, dropped_edges=0, vehicles=12),
+    recording=RecordingSettings(warm_up=1.0),
+    driving=DrivingSettings(duration=3.0),
 )
 BIRDVIEW, LATENT = (f"study.sim.register:study/{name}Town-v0" for name in ("Birdview", "Latent"))
 GO = (2, np.zeros(1, np.float32))
@@ -34,7 +36,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def made(name: str, weights: Path, **options: object) -> gymnasium.Env:
     cell = {"cell": weights} if name == LATENT else {}
-    return gymnasium.make(name, settings=SETTINGS, duration=3.0, render_mode="rgb_array", **cell, **options)
+    return gymnasium.make(name, settings=SETTINGS, render_mode="rgb_array", **cell, **options)
 
 
 @pytest.mark.parametrize("name", [BIRDVIEW, LATENT])
@@ -88,7 +90,7 @@ def test_the_same_seed_and_actions_give_the_same_bits(name: str, weights: Path) 
 
 
 def test_it_shows_bit_for_bit_what_the_recorded_drive_renders_to() -> None:
-    env = BirdviewTownEnv(SETTINGS, duration=2.0)
+    env = BirdviewTownEnv(SETTINGS)
     seen, ended = [env.reset(seed=7)[0]], False
     while not ended:
         observation, _, terminated, truncated, info = env.step(GO)

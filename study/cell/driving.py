@@ -52,7 +52,7 @@ def film_drives(
     for done, (name, place) in enumerate({"worst": 0, "median": len(rows) // 2, "best": len(rows) - 1}.items()):
         row = rows.iloc[place]
         drive, policy = by_seed[row["drive"]], int(row["policy_seed"])
-        (episode,) = rollout(drive, actor, job.settings, crop=job.settings.driving.crop, only=[policy])
+        (episode,) = rollout(drive, actor, job.settings, only=[policy])
         films[f"{name}.gif"] = film(episode, job.settings.birdview, ".gif", row["driving_score"])
         report("progress", done + 1, 3)
     return films
@@ -87,7 +87,7 @@ def _drive(
     rows: list[dict[str, Any]] = []
     for done, (place, drive) in enumerate(drives):
         report("progress", done, len(drives))
-        episodes = rollout(drive, actor, settings, crop=settings.driving.crop)
+        episodes = rollout(drive, actor, settings)
         rows += _rows(place, drive, zip(seeds, episodes, strict=True), ways)
     report("progress", len(drives), len(drives))
     facts = {"seconds": time.perf_counter() - started, "steps": int(sum(row["time"] for row in rows) * 10)}

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from study.config.keys import drive_name
-from study.config.paper import ACCELERATIONS, STEERING_CROP
+from study.config.paper import ACCELERATIONS
 from study.config.settings import SPEEDS, StudySettings
 from study.data.birdview import Image, Renderer
 from study.data.limits import Limits
@@ -31,11 +31,11 @@ class Ride:
 
     The autopilot drives the town's warm-up, and then the lead-in: the past poses that a bird view shows. Steps are
     recorded from the lead-in on. `ended` says in a word what has ended the drive, `reason` in a sentence; both are
-    empty while it goes on. Steering commands are cropped at `crop` either way (Sec. IV-C).
+    empty while it goes on. Steering commands are cropped at `driving.crop` either way (Sec. IV-C).
     """
 
-    def __init__(self, drive: Drive, settings: StudySettings, crop: float = STEERING_CROP) -> None:
-        self.drive, self.settings, self.crop = drive, settings, crop
+    def __init__(self, drive: Drive, settings: StudySettings) -> None:
+        self.drive, self.settings, self.crop = drive, settings, settings.driving.crop
         self.steps = round(drive.duration / DT)
         self.lead_in = settings.birdview.history
         if self.steps < 1:

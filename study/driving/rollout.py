@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 
-from study.config.paper import IMAGE, STEERING_CROP
+from study.config.paper import IMAGE
 from study.config.settings import SPEEDS, StudySettings
 from study.data.limits import Limits
 from study.data.true_state import Columns
@@ -28,7 +28,6 @@ def rollout(
     actor: Actor,
     settings: StudySettings,
     *,
-    crop: float = STEERING_CROP,
     only: Collection[int] | None = None,
 ) -> list[Episode]:
     """Return a drive as each of the actor's drivers has driven it, at 10 Hz, all side by side in copies of the town.
@@ -37,11 +36,11 @@ def rollout(
 
     An Episode's `source["drive"]` has the ego's agent number, the step at which the actor took over, and what ended the
     drive: "time", "collision", "off route", "blocked", or "failure" with its reason. Equal arguments give equal bits.
-    Steering is cropped at `crop`, the paper's by default (Sec. IV-C). In our town that is too little for right turns:
-    the expert itself, cropped there, leaves its way; at 0.42 it does not.
+    Steering is cropped at `driving.crop`. The paper's 0.25 (Sec. IV-C) is too little for right turns of our town: the
+    expert itself, cropped there, leaves its way; at 0.42 it does not.
     Raises ActorError when the actor raises, BadInputError for a town that cannot be drawn.
     """
-    first = Ride(drive, settings, crop)
+    first = Ride(drive, settings)
     if actor.sees:
         first.paint_map()
     rides = [first, *(first.copy() for _ in range(actor.drivers - 1))]

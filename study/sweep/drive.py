@@ -107,8 +107,7 @@ def _rollout(plan: Plan, chosen: Drive, actor: Actor, driver: int) -> Episode:
     steps = round(chosen.duration / DT)
     with click.progressbar(length=steps, label=f"{actor.name} drives", file=sys.stderr) as bar:
         try:
-            watched, crop = _Watched(actor, bar), plan.settings.driving.crop
-            (episode,) = rollout(chosen, watched, plan.settings, crop=crop, only=[driver])
+            (episode,) = rollout(chosen, _Watched(actor, bar), plan.settings, only=[driver])
         except ActorError as error:
             raise BadInputError(f"{error}{place(error.__cause__ or error)}") from error
     return episode
