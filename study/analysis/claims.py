@@ -1,28 +1,32 @@
-"""The paper's claims, and a verdict on each by its rule.
+"""The paper's claims and, in section "ours", some of ours, and a verdict on each by its rule.
 
 To add a claim, add its record to `CLAIMS`, at the end of this file. A claim rests on one or more findings, each of
 which holds, fails or stays open (`study.analysis.rules`): if all hold, the claim is reproduced; if one fails, it is not
 reproduced; else it is inconclusive, or it cannot be tested at this size where the open findings have too little power.
-A claim about little data is not tested at this scale when an encoder has not learned (`study.analysis.learned`).
+A claim about little data is not tested at this scale when an encoder has not learned (`study.analysis.learned`). A
+claim about driving is not tested where the policies have not driven.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from study.analysis import effects, learning_curves, predictions
+from study.analysis import driving, effects, learning_curves, predictions
 from study.analysis.effects import label, results_at
 from study.analysis.learned import unlearned
-from study.analysis.learning_curves import ACCURACY, KEYFRAME, STEERING, Point
+from study.analysis.learning_curves import ACCURACY, DRIVING, KEYFRAME, STEERING, Point
 from study.analysis.rules import (
     ABOVE,
+    DRIVES_BETTER,
     GOOD_STEERING,
     MORE_SPREAD,
     REACH,
     REACHES,
+    SAME_ORDER,
     SAME_STEERING,
     Evidence,
     Finding,
@@ -42,6 +46,7 @@ Outcome = Literal[
     "not tested",
 ]
 OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)
+OURS = "ours"  # the section of a claim that is not the paper's
 
 
 @dataclass(frozen=True)
@@ -65,11 +70,12 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Claim:
-    """A claim of the paper.
+    """A claim of the paper, or one of ours.
 
-    `section` of the paper; `needs`: the head sets without which a sweep cannot test it; `pairs`: which cells of a grid
-    it compares, none where the sweep lacks the data fractions; `rule` decides on each pair; `learned`: whether it is
-    about what encoders have learned from less data, so that each of them must have learned.
+    `section` of the paper, or OURS; `needs`: the head sets without which a sweep cannot test it; `pairs`: which cells
+    of a grid it compares, none where the sweep lacks the data fractions; `rule` decides on each pair; `learned`:
+    whether it is about what encoders have learned from less data, so that each of them must have learned; `metric`: the
+    scores without which a cell cannot be judged.
     """
 
     name: str
@@ -79,18 +85,23 @@ class Claim:
     rule: Rule
     pairs: Callable[[Grid], list[Pair]]
     learned: bool = False
+    metric: str = ACCURACY
 
 
 def judge(record: SweepRecord) -> list[Verdict]:
     """Return a verdict on each of `CLAIMS`, also on those that the sweep cannot test."""
     table, base = record.table(), ("rec", max(record.grid.fractions))
     panels = {metric: learning_curves.panel(table, metric) for metric in (ACCURACY, STEERING, KEYFRAME)}
+    by_drive: dict[str, effects.Drives] = {
+        metric: effects.drive_scores(record, metric, panel) for metric, panel in panels.items()
+    }
+    panels[DRIVING], by_drive[DRIVING] = driving.panel(record)
     return weigh(
         Evidence(
             record.grid,
             panels,
             steering_floor(record, base) if results_at(record, base) else math.nan,
-            {metric: effects.drive_scores(record, metric, panel) for metric, panel in panels.items()},
+            by_drive,
             unlearned(record, panels[ACCURACY]),
         )
     )
@@ -152,7 +163,12 @@ def _why_not(claim: Claim, evidence: Evidence) -> tuple[str, tuple[str, ...]]:
     if not pairs:
         return f"This sweep lacks the data fractions; it has {', '.join(f'{100 * x:g} %' for x in grid.fractions)}.", ()
     missing = tuple(label(point, grid) for point in _points(pairs) if point not in evidence.panels[ACCURACY])
-    return (f"Not finished: {', '.join(missing)}." if missing else ""), missing
+    if missing:
+        return f"Not finished: {', '.join(missing)}.", missing
+    if not evidence.panels.get(claim.metric):
+        return "Its policies have not driven (--drive true).", ()
+    missing = tuple(label(point, grid) for point in _points(pairs) if point not in evidence.panels[claim.metric])
+    return (f"Not driven: {', '.join(missing)} (--drive true)." if missing else ""), missing
 
 
 def steering_floor(record: SweepRecord, point: Point) -> float:
@@ -270,6 +286,33 @@ CLAIMS: dict[str, Claim] = {
                 lambda grid, base: [(("full", fraction), base) for fraction in REACH if fraction in grid.fractions]
             ),
             learned=True,
+        ),
+        Claim(
+            "C1",
+            OURS,
+            "full drives better than rec.",
+            ("rec", "full"),
+            DRIVES_BETTER,
+            at_top(("full", "rec")),
+            metric=DRIVING,
+        ),
+        Claim(
+            "C2",
+            OURS,
+            "Adding plan helps driving more than adding pred.",
+            ("rec+pred", "rec+plan"),
+            DRIVES_BETTER,
+            at_top(("rec+plan", "rec+pred")),
+            metric=DRIVING,
+        ),
+        Claim(
+            "C3",
+            OURS,
+            "The order of head sets by accuracy is their order by driving score.",
+            PAPER_SETS,
+            SAME_ORDER,
+            at_top(*itertools.combinations(PAPER_SETS, 2)),
+            metric=DRIVING,
         ),
     )
 }

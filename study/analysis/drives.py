@@ -7,7 +7,7 @@ by drive are those of the predictions after the last epoch.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -24,11 +24,12 @@ class DriveScores:
     """Scores of policies on each test drive.
 
     `scores`: mean over a drive's frames, index (encoder_seed, policy_seed), one column for each drive; `frames`: how
-    many each drive has, its weight in the score on all frames [drives].
+    many each drive has, its weight in the score on all frames [drives]; `word`: what such drives are called.
     """
 
     scores: pd.DataFrame
     frames: Array
+    word: str = "test drives"
 
     @property
     def weights(self) -> Array:
@@ -43,7 +44,7 @@ class DriveScores:
         """Return the differences of the seeds that both have; None where the drives are others."""
         if not self.same_drives(other):
             return None
-        return DriveScores((self.scores - other.scores).dropna(), self.frames)
+        return replace(self, scores=(self.scores - other.scores).dropna())
 
 
 Frames = tuple[Array, NDArray[np.bool_] | None]  # a score of each policy on each frame [S, N], and which frames count

@@ -13,14 +13,14 @@ from statsmodels.stats.multitest import multipletests
 from study.analysis import comparisons, intervals, learning_curves
 from study.analysis.drives import DriveScores, by_drive
 from study.analysis.intervals import Estimate, Sample
-from study.analysis.learning_curves import ACCURACY, Panel, Point
+from study.analysis.learning_curves import ACCURACY, DRIVING, Panel, Point
 from study.config.grid import Grid, Rules
 from study.config.heads import HEAD_SETS
 from study.config.settings import FromJson, Number
 from study.results.cell_result import CellResult
 from study.results.sweep_record import SweepRecord
 
-Unit = Literal["points", "loss", "epochs", "ratio"]
+Unit = Literal["points", "loss", "epochs", "ratio", "score"]
 Interval = Annotated[Estimate, FromJson]  # the same value, that pydantic can read back from a report.json
 
 MINUS = "\N{MINUS SIGN}"
@@ -103,11 +103,11 @@ def drive_scores(record: SweepRecord, metric: str, points: Iterable[Point]) -> d
     return {point: by_drive(results_at(record, point), metric) for point in points}
 
 
-def paired_contrasts(record: SweepRecord, metric: str, curves: Panel) -> list[Contrast]:
-    """Return every planned contrast whose two cells are finished."""
+def paired_contrasts(record: SweepRecord, metric: str, curves: Panel, drives: Drives | None = None) -> list[Contrast]:
+    """Return every planned contrast whose two cells are finished; `drives`: scores by drive, if not of predictions."""
     plan = planned(record.grid)
     level = 1 - record.grid.rules.alpha / max(len(plan), 1)
-    cells = samples(curves, drive_scores(record, metric, curves))
+    cells = samples(curves, drive_scores(record, metric, curves) if drives is None else drives)
     differences = {
         (first, second): sample
         for first, second in plan
@@ -132,7 +132,7 @@ def paired_contrasts(record: SweepRecord, metric: str, curves: Panel) -> list[Co
             p_holm,
             comparisons.improvement(cells[first].values.to_numpy(), cells[second].values.to_numpy()),
             comparisons.detectable(mean),
-            allowance(record.grid.rules, curves, (first, second)) if metric == ACCURACY else 0.0,
+            allowance(record.grid.rules, curves, (first, second), metric),
             math.sqrt(mean.of_units),
             math.sqrt(mean.of_drives),
             mean.drives,
@@ -141,9 +141,15 @@ def paired_contrasts(record: SweepRecord, metric: str, curves: Panel) -> list[Co
     ]
 
 
-def allowance(rules: Rules, curves: Panel, points: Iterable[Point]) -> float:
-    """Return what a contrast of some cells may owe to encoders' seeds: of those cells that have one encoder only."""
-    return rules.allowance(point[0] for point in points if learning_curves.encoders(curves[point]) == 1)
+def allowance(rules: Rules, curves: Panel, points: Iterable[Point], metric: str = ACCURACY) -> float:
+    """Return what a contrast of some cells may owe to encoders' seeds: of those cells that have one encoder only.
+
+    0 for a metric that the rules have no allowance for.
+    """
+    alone = [point[0] for point in points if learning_curves.encoders(curves[point]) == 1]
+    if metric == DRIVING:
+        return rules.driving_allowance * math.sqrt(len(alone) / 2)
+    return rules.allowance(alone) if metric == ACCURACY else 0.0
 
 
 def results_at(record: SweepRecord, point: Point) -> list[CellResult]:

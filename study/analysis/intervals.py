@@ -181,7 +181,7 @@ def crossed(*samples: Sample) -> Crossed:
     total = satterthwaite([*of_units, *of_drives, *((-variance, freedom) for variance, freedom in within)])
     variance, freedom = max(total, rows, columns, key=lambda part: part[0])
     drives = min(len(part.frames) for part in known)
-    over = f"{names} and {drives} test drives, crossed"
+    over = f"{names} and {drives} {known[0].word}, crossed"
     return Crossed(value, variance, freedom, rows[0], columns[0], fewest, drives, over)
 
 

@@ -13,6 +13,7 @@ Point = tuple[str, float]  # head set and data fraction
 Panel = dict[Point, pd.DataFrame]  # index (encoder_seed, policy_seed), one column for each epoch
 
 ACCURACY, STEERING, KEYFRAME = "acceleration_accuracy", "steering_loss", "keyframe_accuracy"
+DRIVING = "driving_score"  # at the wheel, 0 to 100
 LAST = 5  # epochs whose mean is a final score (Sec. V-B)
 
 

@@ -19,7 +19,7 @@ from scipy import special
 from study.analysis import comparisons, convergence, effects, intervals, learning_curves
 from study.analysis.effects import Drives, Interval, Unit, difference_label, label
 from study.analysis.intervals import Crossed, Estimate, Sample
-from study.analysis.learning_curves import ACCURACY, KEYFRAME, STEERING, Panel, Point
+from study.analysis.learning_curves import ACCURACY, DRIVING, KEYFRAME, STEERING, Panel, Point
 from study.config.grid import Grid, Rules
 from study.config.settings import Number
 
@@ -79,9 +79,9 @@ class Evidence:
         """Return whether a cell has one encoder only."""
         return learning_curves.encoders(self.panels[ACCURACY][point]) == 1
 
-    def allowance(self, pair: Pair) -> float:
-        """Return what a difference in accuracy may owe to other encoders: 0 where both cells have several."""
-        return effects.allowance(self.rules, self.panels[ACCURACY], pair)
+    def allowance(self, pair: Pair, metric: str = ACCURACY) -> float:
+        """Return what a difference may owe to other encoders: 0 where both cells have several."""
+        return effects.allowance(self.rules, self.panels[metric], pair, metric)
 
     def steering_allowance(self, points: Sequence[Point]) -> float:
         """Return what a steering loss, or a difference of two, may owe to other encoders."""
@@ -113,18 +113,34 @@ def _find_above(evidence: Evidence, pairs: Sequence[Pair]) -> list[Finding]:
     return [_above(evidence, metric, pair, len(pairs)) for metric in metrics for pair in pairs]
 
 
+def _find_better_driving(evidence: Evidence, pairs: Sequence[Pair]) -> list[Finding]:
+    """Return findings that the first's driving score is above the second's."""
+    return [_above(evidence, DRIVING, pair, len(pairs)) for pair in pairs]
+
+
+def _find_same_order(evidence: Evidence, pairs: Sequence[Pair]) -> list[Finding]:
+    """Return findings that of each pair the cell of higher accuracy has the higher driving score, too."""
+    by_accuracy = [pair if evidence.difference(ACCURACY, pair).value >= 0 else pair[::-1] for pair in pairs]
+    return _find_better_driving(evidence, by_accuracy)
+
+
 def _above(evidence: Evidence, metric: str, pair: Pair, findings: int) -> Finding:
-    rules, mean, allowance = evidence.rules, evidence.difference(metric, pair), evidence.allowance(pair)
+    rules, mean = evidence.rules, evidence.difference(metric, pair)
+    unit: Unit = "score" if metric == DRIVING else "points"
+    margin, effect = (
+        (rules.driving_margin, rules.driving_effect) if metric == DRIVING else (rules.accuracy_margin, rules.effect)
+    )
+    allowance = evidence.allowance(pair, DRIVING if metric == DRIVING else ACCURACY)
     low, high = mean.limits(1 - rules.alpha, allowance)[0], mean.limits(1 - rules.alpha / findings, allowance)[1]
     return Finding(
         difference_label(*pair, evidence.grid) + ", keyframes" * (metric == KEYFRAME),
-        "points",
+        unit,
         mean.estimate(),
         (low, high),
         "above 0",
-        _state(holds=low > 0, fails=high < rules.accuracy_margin),
+        _state(holds=low > 0, fails=high < margin),
         mean.p(allowance),
-        mean.power(rules.effect - allowance, 1 - rules.alpha),
+        mean.power(effect - allowance, 1 - rules.alpha),
         beside=metric == KEYFRAME,
     )
 
@@ -275,4 +291,28 @@ MORE_SPREAD = Rule(
     ),
     lambda rules: f"A true ratio of {rules.spread_ratio:g}",
     _find_more_spread,
+)
+
+
+def _better_driving(rules: Rules) -> str:
+    return (
+        f"The lower end of each difference's interval in driving score, at {100 * (1 - rules.alpha):g} %, lies above "
+        f"0. It fails where the simultaneous interval excludes a gain of {rules.driving_margin:g} points of 100. "
+        f"With one encoder for each cell the interval is widened by {rules.driving_allowance:g} points on either side "
+        "for other encoders, which is a guess."
+    )
+
+
+DRIVES_BETTER = Rule(
+    _better_driving,
+    lambda rules: f"A true difference of {rules.driving_effect:g} points of driving score",
+    _find_better_driving,
+)
+SAME_ORDER = Rule(
+    lambda rules: (
+        "Each pair of head sets is put in the order of its mean accuracy, however small the difference. "
+        f"{_better_driving(rules)}"
+    ),
+    DRIVES_BETTER.alternative,
+    _find_same_order,
 )

@@ -84,6 +84,17 @@ class Rules(Settings):
     learned_share: Share = Field(
         0.25, description="share of the way from a constant picture's loss to the least possible that a head must make"
     )
+    driving_margin: NotNegative = Field(
+        2.0, description="smallest difference in driving score (0 to 100) that matters; of claims that are ours"
+    )
+    driving_effect: Positive = Field(
+        5.0, description="true difference in driving score for which a finding's power is stated"
+    )
+    driving_allowance: NotNegative = Field(
+        5.0,
+        description="what two encoders may differ in driving score by their seeds alone, with one encoder for each "
+        "cell; a guess until several encoders of a head set have driven",
+    )
     fixed: Fixed | None = Field(None, description="when these rules were last changed, and the commit that holds them")
 
     def allowance(self, heads: Iterable[str]) -> float:
@@ -117,7 +128,9 @@ class Grid(Settings):
         tuple(BASELINES), description="cells without a head set to compare with (docs/reading-a-report.md); [] for none"
     )
     drive: bool = Field(default=False, description="policies drive in closed loop, too (docs/drive.md)")
-    claims: tuple[str, ...] = Field((), description="claims of the paper that this sweep tests")
+    claims: tuple[str, ...] = Field(
+        (), description="claims of the paper, and of ours, that this sweep tests (docs/paper.md)"
+    )
     rules: Rules = Field(Rules(), description="when a claim counts as reproduced")
     settings: dict[str, Any] = Field(default_factory=dict, description="settings that differ from every profile's")
 

@@ -41,6 +41,7 @@ def show(metric: Metric, value: float | None, *, sign: bool = False) -> str:
 
 points = partial(fixed, digits=2, factor=100, sign=True)
 epochs = partial(fixed, digits=0)
+scores = partial(fixed, digits=1, sign=True)
 
 
 def between(low: float, high: float, show: Show) -> str:
@@ -93,4 +94,5 @@ UNITS = {
     "loss": Unit(LOSS, partial(fixed, digits=3, factor=1e3, sign=True), f"{{}} · {LOSS}"),
     "epochs": Unit("epoch", epochs, "epoch {}"),
     "ratio": Unit("ratio", fixed, "ratio {}"),
+    "score": Unit("points of driving score", scores, "{} points of driving score"),
 }
