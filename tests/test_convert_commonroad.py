@@ -9,7 +9,7 @@ from study.episode.importing import check_drives
 from study.episode.schema import GREEN, RED, YELLOW
 from study.errors import BadInputError
 
-pytest.importorskip("commonroad", reason="the extra 'commonroad' is not installed")
+pytest.importorskip("commonroad", reason="commonroad-io is not installed")
 STEPS = 80
 
 

@@ -35,7 +35,7 @@ def convert(sources: Sequence[Path], out: Path, cut: float) -> list[str]:
     """
     if find_spec("commonroad") is None:
         raise BadInputError(
-            "the extra 'commonroad' is not installed: pip install 'study[commonroad]' brings its reader"
+            "commonroad-io is not installed: pip install 'study[commonroad]', then pip install --no-deps commonroad-io"
         )
     return write_drives(_recordings(sources), out, cut)
 
