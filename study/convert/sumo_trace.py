@@ -222,17 +222,22 @@ def run_scenario(scenario: Path, net: Net, seed: int, warm_up: float, seconds: f
         connection.simulationStep(connection.simulation.getTime() + warm_up if warm_up else 0)
         begin, step = connection.simulation.getTime(), 0
         new = connection.vehicle.getIDList()
+        codes = _codes()
+        connection.simulation.subscribe((codes.VAR_DEPARTED_VEHICLES_IDS, codes.VAR_MIN_EXPECTED_VEHICLES))
         for tl in states:
-            connection.trafficlight.subscribe(tl, (_codes().TL_RED_YELLOW_GREEN_STATE,))
+            connection.trafficlight.subscribe(tl, (codes.TL_RED_YELLOW_GREEN_STATE,))
         while True:
             _take(connection, new, step, rows, kinds)
             for tl, result in connection.trafficlight.getAllSubscriptionResults().items():
                 states[tl].extend(result.values())
             step += 1
-            if step >= round(seconds * RATE_HZ) or not connection.simulation.getMinExpectedNumber():
+            if step >= round(seconds * RATE_HZ):
                 break
             connection.simulationStep()
-            new = connection.simulation.getDepartedIDList()
+            world = connection.simulation.getSubscriptionResults()
+            new = world[codes.VAR_DEPARTED_VEHICLES_IDS]
+            if not world[codes.VAR_MIN_EXPECTED_VEHICLES]:
+                break
         still = set(connection.vehicle.getIDList())  # the others have arrived, and shown their way
         routes = [list(connection.vehicle.getRoute(name)) if name in still else [] for name in rows.known]
     at, vehicle, lane, values, names = rows.columns()
