@@ -119,7 +119,7 @@ def test_a_policy_of_nan_ends_its_drives_as_failures_and_the_others_drive_on(
     weights = {name: value.copy() for name, value in result.policies.items()}
     weights["steering_2_bias"][1] = np.nan
     drives = planned_drives(plan.settings)
-    ways = drive_expert(plan.settings, drives, lambda *_: None).curves.set_index("drive")[WAY].to_dict()
+    ways = drive_expert(plan.settings, drives).curves.set_index("drive")[WAY].to_dict()
     spoiled = dataclasses.replace(result, policies=weights)
     table = drive_policies(job_of(plan, key, tmp_path), spoiled, drives, ways, lambda *_: None).curves
     assert (table[table["policy_seed"] == 1]["ended"] == "failure").all()

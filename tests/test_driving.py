@@ -26,6 +26,7 @@ from study.driving.metrics import DriveScores, collisions_per_km, progress, scor
 from study.driving.observations import Observation
 from study.driving.ride import BLOCKED
 from study.driving.rollout import ActorError, rollout
+from study.driving.surface import beyond_lanes, off_road
 from study.encoder.networks import untrained_encoder
 from study.episode.checks import check_episode
 from study.episode.schema import GREEN, RED, YELLOW, Episode, Lane
@@ -244,6 +245,16 @@ def test_a_red_light_is_run_when_the_bumper_crosses_its_line() -> None:
 
 
 STREET = (Lane(0, np.array([[-50.0, 0.0], [50.0, 0.0]]), 3.5), Lane(1, np.array([[-50.0, 3.5], [50.0, 3.5]]), 3.5))
+
+
+def test_points_off_the_road_are_those_that_are_beyond_every_lane() -> None:
+    (episode,) = rollout(dataclasses.replace(DRIVE, duration=0.1), Expert(), SETTINGS)
+    draw = rng(0, "test points")
+    for spread in (5.0, 500.0):
+        points = episode.lanes[0].centre[0] + draw.normal(size=(700, 2)) * spread
+        expected = (beyond_lanes(points, episode.lanes) > 0.3).all(axis=1)
+        assert (off_road(points, episode.lanes, 0.3) == expected).all()
+        assert 0 < expected.sum() < len(points)
 
 
 @pytest.mark.parametrize(

@@ -27,9 +27,9 @@ from study.results.drives import EXPERT, WAY
 Drives = list[tuple[str, Drive]]
 
 
-def drive_expert(settings: StudySettings, drives: Drives, report: Reporter) -> Product:
+def drive_expert(settings: StudySettings, drives: Drives) -> Product:
     """Return the expert's drives, one row each, with the way that it makes [m], the length of the others' routes."""
-    return _drive(Expert(), drives, settings, {}, [EXPERT], report)
+    return _drive(Expert(), drives, settings, {}, [EXPERT])
 
 
 def drive_policies(
@@ -37,7 +37,7 @@ def drive_policies(
 ) -> Product:
     """Return the drives of a cell's policies, one row for each policy and drive. `ways`: the expert's, by drive."""
     actor = _actor(job, result, report)
-    return _drive(actor, drives, job.settings, ways, range(actor.drivers), report)
+    return _drive(actor, drives, job.settings, ways, range(actor.drivers))
 
 
 def film_drives(
@@ -49,12 +49,11 @@ def film_drives(
     rows = rows.sort_values(["driving_score", "time", "drive", "policy_seed"])
     by_seed = {drive.seed: drive for _, drive in drives}
     films = {}
-    for done, (name, place) in enumerate({"worst": 0, "median": len(rows) // 2, "best": len(rows) - 1}.items()):
+    for name, place in {"worst": 0, "median": len(rows) // 2, "best": len(rows) - 1}.items():
         row = rows.iloc[place]
         drive, policy = by_seed[row["drive"]], int(row["policy_seed"])
         (episode,) = rollout(drive, actor, job.settings, only=[policy])
         films[f"{name}.gif"] = film(episode, job.settings.birdview, ".gif", row["driving_score"])
-        report("progress", done + 1, 3)
     return films
 
 
@@ -76,20 +75,13 @@ def _first_policies(result: CellResult, count: int) -> CellResult:
 
 
 def _drive(
-    actor: Actor,
-    drives: Drives,
-    settings: StudySettings,
-    ways: dict[int, float],
-    seeds: Collection[int],
-    report: Reporter,
+    actor: Actor, drives: Drives, settings: StudySettings, ways: dict[int, float], seeds: Collection[int]
 ) -> Product:
     started = time.perf_counter()
     rows: list[dict[str, Any]] = []
-    for done, (place, drive) in enumerate(drives):
-        report("progress", done, len(drives))
+    for place, drive in drives:
         episodes = rollout(drive, actor, settings)
         rows += _rows(place, drive, zip(seeds, episodes, strict=True), ways)
-    report("progress", len(drives), len(drives))
     facts = {"seconds": time.perf_counter() - started, "steps": int(sum(row["time"] for row in rows) * 10)}
     return Product({}, pd.DataFrame(rows), facts)
 

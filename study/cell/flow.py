@@ -61,9 +61,7 @@ def expert_flow(settings: StudySettings, drives: Sequence[Any], products: Path) 
     """Have the expert drive, and return its drives, one row each."""
     shares = [drives[first : first + EXPERT_DRIVES] for first in range(0, len(drives), EXPERT_DRIVES)]
     folders = [products / f"drive-{drive_key(settings)}-{first}" for first in range(len(shares))]
-    tasks = [
-        Task(DRIVE, f"{DRIVING_MODULE}:drive_expert", (settings, share), len(share), reports=True) for share in shares
-    ]
+    tasks = [Task(DRIVE, f"{DRIVING_MODULE}:drive_expert", (settings, share), len(share)) for share in shares]
     driven = yield from _keep(folders, (), tasks)
     return pd.concat([product.curves for product in driven], ignore_index=True)
 
@@ -87,7 +85,7 @@ def drive_flow(
     driven = yield from _keep(folders, (), tasks)
     table = pd.concat([expert, *(product.curves for product in driven)], ignore_index=True)
     filming = Task(DRIVE, f"{DRIVING_MODULE}:film_drives", (job, needed, drives, table), reports=True)
-    (films,) = yield Batch([filming])
+    (films,) = yield Batch([filming], before=len(drives))
     return table, films
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from study.analysis.comfort import comfortable
 from study.driving.faults import at_fault
-from study.driving.surface import beyond_lanes, corners
+from study.driving.surface import corners, off_road
 from study.episode.schema import RED, Episode
 
 VEHICLE, LAYOUT, RED_LIGHT = 0.60, 0.65, 0.70  # penalties of the CARLA leaderboard, for each infraction
@@ -144,6 +144,5 @@ def _layout(track: _Track, episode: Episode) -> int:
     """Count the times that a corner of the ego's box left the road."""
     poses = np.stack([track.x, track.y, track.heading], axis=1)
     points = corners(poses, track.agent.length, track.agent.width)
-    beyond = beyond_lanes(points.reshape(-1, 2), episode.lanes).min(axis=1).reshape(-1, 4)
-    out = (beyond > KERB).any(axis=1)
+    out = off_road(points.reshape(-1, 2), episode.lanes, KERB).reshape(-1, 4).any(axis=1)
     return int((np.diff(out.astype(np.int8), prepend=0) == 1).sum())

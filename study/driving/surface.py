@@ -23,6 +23,23 @@ def corners(pose: Floats, length: float, width: float) -> Floats:
     return np.stack([x + along * c - aside * s, y + along * s + aside * c], axis=-1)
 
 
+def off_road(points: Floats, lanes: Sequence[Lane], most: float) -> NDArray[np.bool_]:
+    """Return whether points [P, 2] lie more than `most` [m] beyond the edge of every lane.
+
+    Points that follow each other lie near each other: only lanes around those of a chunk are looked at.
+    """
+    low, high = (np.array([getattr(lane.centre, end)(axis=0) for lane in lanes]) for end in ("min", "max"))
+    reach = np.array([lane.width / 2 for lane in lanes])[:, None] + most + 1
+    off = np.ones(len(points), bool)
+    for begin in range(0, len(points), CHUNK):
+        part = points[begin : begin + CHUNK]
+        near = ((low - reach <= part.max(axis=0)) & (high + reach >= part.min(axis=0))).all(axis=1)
+        close = [lanes[number] for number in np.flatnonzero(near).tolist()]
+        if close:
+            off[begin : begin + CHUNK] = (beyond_lanes(part, close) > most).all(axis=1)
+    return off
+
+
 def beyond_lanes(points: Floats, lanes: Sequence[Lane]) -> Floats:
     """Return how far points [P, 2] lie beyond the edge of each lane [P, lanes] m; not above 0 on the lane."""
     starts = np.concatenate([lane.centre[:-1] for lane in lanes])
