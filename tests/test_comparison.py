@@ -11,6 +11,7 @@ from study.report.model import checked, read_report
 from study.report.rounding import percent
 from study.report.summary import summarise
 from tests.support.processes import ROOT
+from tests.support.synthetic_drives import Wheel, with_drives
 from tests.support.synthetic_records import HEADS_GRID, World, simulate
 
 SMALL = Grid(name="small", title="Small | <b>study</b>", heads=("rec", "full"), policy_seeds=4, claims=("H4",))
@@ -217,3 +218,14 @@ def holds(content, part):
     if isinstance(part, list):
         return len(content) == len(part) and all(map(holds, content, part))
     return content == part
+
+
+def test_sweeps_that_both_drove_are_compared_at_the_wheel():
+    still = simulate(SMALL, FAST)
+    sides = [checked(made(with_drives(still, Wheel(score=score))), "a") for score in ({"full": 40.0}, {"full": 70.0})]
+    text = compared(*sides, ("old", "new"))
+    part = text.split("At the wheel")[1].split("Order of head sets")[0]
+    assert "20 in the first and 20 in the\nsecond" in part or "20 in the first and 20 in the second" in part
+    change = float(row(part, "full")[3].removeprefix("+"))
+    assert change == pytest.approx(30, abs=4)
+    assert "At the wheel" not in compared(sides[0], checked(made(still), "b"), ("old", "new"))

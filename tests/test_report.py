@@ -21,6 +21,7 @@ from study.report.model import read_report
 from study.report.scale import training_scale
 from study.report.summary import summarise
 from study.report.text import document
+from tests.support.synthetic_drives import Wheel, with_drives
 from tests.support.synthetic_records import DATASIZE_GRID, HEADS_GRID, World, simulate
 
 SMALL = Grid(name="small", title="T", heads=("rec", "full"), policy_seeds=3, baselines=())
@@ -378,3 +379,59 @@ def test_help_needs_no_heavy_library():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "[]"
+
+
+# --- at the wheel ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def driven(tmp_path_factory):
+    """Return the record of a sweep whose policies have driven, and the folder of its report."""
+    ours = HEADS_GRID.model_copy(update={"claims": (*HEADS_GRID.claims, "C1", "C2", "C3")})
+    record, folder = with_drives(simulate(ours, World(epochs=6))), tmp_path_factory.mktemp("driven")
+    build_report(record, folder)
+    return record, folder
+
+
+def test_a_report_of_policies_that_have_driven_says_how(driven):
+    record, folder = driven
+    report = read_report(folder / "heads")
+    assert [place.place for place in report.driving.places] == ["town", "unseen"]
+    assert [row.heads for row in report.driving.town.cells] == ["rec", "rec+pred", "rec+plan", "full"]
+    assert {row.drives for row in report.driving.town.rows} == {20}
+    assert {"driving_score", "driving_ends", "accuracy_driving", "driving_differences"} <= set(report.figures)
+    pd.testing.assert_frame_equal(pd.read_parquet(folder / "heads/drives.parquet"), record.drive_table)
+    text = pdf_text(folder / "heads.pdf")
+    assert "At the wheel, driving score (0 to 100) on 20 held-out drives" in pages(folder / "heads.pdf")[0]
+    for row in report.driving.town.rows:
+        assert f"{row.cell} {row.metrics['driving_score'].mean:.1f}" in text
+    assert "C1 (ours, not the paper" in text
+    assert "Its n is the 20 drives" in text
+
+
+def test_a_report_without_drives_has_no_page_and_no_table_of_them(driven, tmp_path):
+    record = driven[0]
+    folder = shutil.copytree(driven[1], tmp_path / "reports")
+    build_report(replace(record, drives={}), folder)
+    assert not (folder / "heads/drives.parquet").exists()
+    assert read_report(folder / "heads").driving is None
+    text = pdf_text(folder / "heads.pdf")
+    assert "At the wheel" not in text
+    assert "Its policies have not driven (--drive true)" in text
+
+
+@pytest.mark.parametrize(
+    "wheel", [Wheel(drives=1, unseen=0), Wheel(drives=2, unseen=1, policies=1)], ids=["one drive", "few drives"]
+)
+def test_few_drives_give_a_report_too(wheel):
+    record = with_drives(simulate(SMALL, World(epochs=6)), wheel)
+    text = markdown(document(summarise(record)))
+    assert "## At the wheel" in text.replace("### ", "## ")
+    assert "nan" not in text
+
+
+def test_cells_that_have_not_driven_are_left_out_of_the_tables():
+    record = with_drives(simulate(SMALL, World(epochs=6)), without=("rec",))
+    report = summarise(record)
+    assert [row.heads for row in report.driving.town.cells] == ["full"]
+    assert report.driving.contrasts == ()

@@ -103,7 +103,7 @@ RATES: dict[str, Metric] = {
 PER_KM: dict[str, Metric] = {
     metric.name: metric
     for metric in (
-        _per_km("at_fault_per_km", "at fault", "Per km of all drives: collisions at fault and others,"),
+        _per_km("at_fault_per_km", "at fault", "Collisions at fault and others,"),
         _per_km("others_per_km", "others"),
         _per_km("red_lights_per_km", "red lights", "red lights run,"),
         _per_km("layout_per_km", "layout", "and layout: a corner more than 0.3 m beyond the road."),

@@ -6,7 +6,6 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -18,6 +17,8 @@ from numpy.typing import NDArray
 from study.config.paper import ACCELERATIONS
 from study.figures.style import BLUE, GREY, SIDES, STYLE, literal, look, new_figure
 
+ACCURACY_LABEL = "difference in acceleration accuracy, test [percentage points]"
+
 
 @mpl.rc_context(STYLE)
 def differences(rows: Sequence[Mapping[str, float | str]]) -> Figure:
@@ -26,27 +27,30 @@ def differences(rows: Sequence[Mapping[str, float | str]]) -> Figure:
     Each row has name, value, low, high, low_all, high_all (shares, not points). The grey zone is the row's `allowance`
     for other encoders, 0 for none.
     """
+    return bars(rows, 100.0, ACCURACY_LABEL)
+
+
+def bars(rows: Sequence[Mapping[str, float | str]], scale: float, label: str) -> Figure:
+    """Draw differences of any score, as `differences` does: the rows' numbers times `scale`."""
     figure, (axes,) = new_figure(0.7 + 0.24 * len(rows))
-    value, low, high, least, most = _columns(rows, ("value", "low", "high", "low_all", "high_all"))
-    places, (allowance,) = np.arange(len(rows)), _columns(rows, ("allowance",))
+    names = ("value", "low", "high", "low_all", "high_all", "allowance")
+    value, low, high, least, most, allowance = (scale * np.array([row[name] for row in rows], float) for name in names)
+    places = np.arange(len(rows))
     axes.barh(places, 2 * allowance, 1.0, -allowance, color=GREY, alpha=0.15, linewidth=0)
     axes.hlines(places, least, most, color=BLUE, linewidth=0.8)
     axes.hlines(places, low, high, color=BLUE, linewidth=2.6)
     axes.plot(value, places, "o", color="black", markersize=3.5)
-    _difference_axes(axes, [str(row["name"]) for row in rows], (len(rows) - 0.4, -0.6))
+    _difference_axes(axes, [str(row["name"]) for row in rows], (len(rows) - 0.4, -0.6), label)
     return figure
 
 
-def _columns(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> list[NDArray[np.float64]]:
-    """Return columns of rows, shares as points."""
-    return [100 * np.array([row[name] for row in rows], np.float64) for name in names]
-
-
-def _difference_axes(axes: Axes, names: Sequence[str], limits: tuple[float, float]) -> None:
+def _difference_axes(
+    axes: Axes, names: Sequence[str], limits: tuple[float, float], label: str = ACCURACY_LABEL
+) -> None:
     """Name the rows, from the top down, and mark no difference."""
     axes.axvline(0, color=GREY, linewidth=0.6, zorder=1)
     axes.set_yticks(range(len(names)), names)
-    axes.set(ylim=limits, xlabel="difference in acceleration accuracy, test [percentage points]")
+    axes.set(ylim=limits, xlabel=label)
     _without_left_side(axes)
 
 

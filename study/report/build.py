@@ -29,12 +29,14 @@ from study.tracking.tracker import Tracker
 from study.tracking.variants import with_variants
 
 TEMPLATE = Path(__file__).with_name("report.typ")
+DRIVES = "drives.parquet"
 
 
 def build_report(record: SweepRecord, folder: Path = HERE.reports) -> Path:
     """Write `<folder>/<sweep>.pdf` and, under `<folder>/<sweep>/`, report.json, curves.parquet and figures/.
 
-    The same record gives the same bytes. Works for a sweep with unfinished cells, and says so on its first page.
+    Where policies have driven, there is drives.parquet, too. The same record gives the same bytes. Works for a sweep
+    with unfinished cells, and says so on its first page.
     """
     report, files = summarise(record), folder / record.grid.name
     fonts = fonts_for(report.json().decode())
@@ -49,6 +51,10 @@ def build_report(record: SweepRecord, folder: Path = HERE.reports) -> Path:
             file.unlink()
     write_atomic(files / "report.json", report.json())
     write_atomic(files / "curves.parquet", record.table(baselines=True).to_parquet(index=False))
+    if record.drive_table.empty:
+        (files / DRIVES).unlink(missing_ok=True)  # of an earlier report
+    else:
+        write_atomic(files / DRIVES, record.drive_table.to_parquet(index=False))
     pictures = {f"figures/{file.name}": file.read_bytes() for file in written if file.suffix == ".svg"}
     pdf = folder / f"{record.grid.name}.pdf"
     sweep = report.sweep
@@ -73,7 +79,8 @@ def publish(tracker: Tracker, name: str, profile: str | None, folder: Path) -> t
     """Build the report from the tracker alone, and add it to the sweep's run. Returns the PDF's path and exit code."""
     record = complete_cells(tracker.reader, name, profile)
     pdf, files = build_report(record, folder), folder / name
-    tracker.log_files(record.run_id, [pdf, files / "report.json", files / "curves.parquet"], "report")
+    tables = [files / name for name in ("report.json", "curves.parquet", DRIVES) if (files / name).exists()]
+    tracker.log_files(record.run_id, [pdf, *tables], "report")
     tracker.log_files(record.run_id, sorted((files / "figures").glob("*")), "figures")
     return pdf, exit_code(record)
 

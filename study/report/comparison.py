@@ -16,11 +16,12 @@ from study.analysis import comparisons
 from study.analysis.claims import Verdict
 from study.analysis.effects import MINUS, ordered
 from study.analysis.intervals import Estimate
-from study.analysis.learning_curves import ACCURACY, Point
+from study.analysis.learning_curves import ACCURACY, DRIVING, Point
 from study.analysis.metrics import Metric
 from study.config.baselines import BASELINES
 from study.config.grid import Cell
 from study.report.document import Block, Inline, bold, code, italic, lines, plain, table
+from study.report.driving import EXPERT
 from study.report.model import Report, Score, Spread
 from study.report.rounding import NOTHING, UNITS, between, epochs, fixed, interval, percent, show
 from study.report.text import counts, render, title
@@ -58,6 +59,7 @@ def compare(first: Report, second: Report, names: tuple[str, str], picture: str 
             [cells[point] for point in cells if point in one.by_point and point not in other.by_point]
             for one, other in (sides, sides[::-1])
         ],
+        wheel=_driving(sides),
         orders=table(("fraction", "first", "second", "order"), _orders(sides), left=4),
         convergence=_convergence(sides, cells),
         changed=_changed(sides),
@@ -144,6 +146,30 @@ def _shared_metrics(sides: Sides) -> list[Metric]:
 
 def _spreads(sides: Sides, name: str, point: Point) -> list[Spread | None]:
     return [side.by_point[point].metrics.get(name) for side in sides]
+
+
+def _driving(sides: Sides) -> dict[str, object]:
+    """Return the tables of driving scores in the study's town, of the cells that drove in both; empty without any."""
+    first, second = (side.driving.town if side.driving else None for side in sides)
+    if not first or not second or not sides[1].driving:
+        return {}
+    others = {row.point: row for row in second.rows}
+    pairs = [(row, others[row.point]) for row in first.rows if row.point in others]
+    rows = [
+        table(
+            (title(metric), "first (n)", "second (n)", "difference", "95 %"),
+            [
+                [one.cell, *_beside(metric, *(row.metrics.get(metric.name) for row in (one, other)))]
+                for one, other in pairs
+            ],
+        )
+        for metric in sides[1].driving.scores
+    ]
+    changes = [
+        difference(one.metrics[DRIVING], other.metrics[DRIVING]) for one, other in pairs if one.point[0] != EXPERT
+    ]
+    drives = [{row.drives for row in place.rows} for place in (first, second)]
+    return {"tables": rows, "changes": changes, "drives": drives} if pairs else {}
 
 
 def _changes(sides: Sides, name: str, both: list[Point]) -> list[Estimate]:

@@ -20,6 +20,7 @@ from study.figures import curves, differences, pictures
 from study.figures.style import Drawing
 from study.products import Arrays
 from study.report.comparison import ends_text, labels, side_key
+from study.report.driving import draw_driving
 from study.report.model import Report, Score, VariedSetting
 from study.results.cell_result import CellResult
 from study.results.sweep_record import SweepRecord
@@ -41,6 +42,8 @@ def draw(record: SweepRecord, report: Report) -> dict[str, Drawing]:
         drawn["by_encoder"] = _encoders(record)
     drawn["paired_differences"] = _differences(report)
     drawn |= {f"confound_{row.setting.replace('.', '_')}": _confound(row) for row in report.confounds}
+    if report.driving:
+        drawn |= draw_driving(record, report.driving)
     drawn["encoder_losses"] = _encoder_losses(record, report)
     first = _first_results(record, report)
     drawn |= {"latent_maps": _latents(first), **_pictures(first)}

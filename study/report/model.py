@@ -126,6 +126,67 @@ class Score(Part):
         return self.metrics[learning_curves.ACCURACY]
 
 
+class DrivingScore(Part):
+    """What the policies of a cell, or the expert, did at the wheel in one place.
+
+    `policies`: how many drove, each the same `drives`; `metrics`: means over drives by name (driving.SCORES); `rates`:
+    shares of drives (RATES); `per_km`: counts over the way of all drives (PER_KM); `ended`: the share of drives that
+    each of ENDS has ended.
+    """
+
+    cell: str
+    heads: str
+    fraction: float
+    policies: int
+    drives: int
+    metrics: dict[str, Spread]
+    rates: dict[str, Interval]
+    per_km: dict[str, Number]
+    ended: dict[str, float]
+
+    @property
+    def point(self) -> Point:
+        """Return head set and fraction."""
+        return (self.heads, self.fraction)
+
+
+class DrivingPlace(Part):
+    """Driving in one place: "town" or "unseen", in words `where`."""
+
+    place: str
+    where: str
+    cells: tuple[DrivingScore, ...]
+    baselines: tuple[DrivingScore, ...] = ()
+    expert: DrivingScore | None = None
+
+    @property
+    def rows(self) -> tuple[DrivingScore, ...]:
+        """Return head sets, baselines and expert, in the order of the tables."""
+        return (*self.cells, *self.baselines, *([self.expert] if self.expert else ()))
+
+
+class Driving(Part):
+    """What policies did at the wheel. `contrasts`: of the driving score in the study's town.
+
+    `correlations`: Spearman's, of accuracy and driving score, over "policies", "cells" and the cells that are "head
+    sets", with the number of each in `counted`.
+    """
+
+    scores: tuple[Metric, ...]
+    rates: tuple[Metric, ...]
+    per_km: tuple[Metric, ...]
+    ends: dict[str, str]
+    places: tuple[DrivingPlace, ...]
+    contrasts: tuple[Contrast, ...]
+    correlations: dict[str, Number]
+    counted: dict[str, int]
+
+    @property
+    def town(self) -> DrivingPlace:
+        """Return driving in the study's town, or in the only place that there is."""
+        return self.places[0]
+
+
 class Convergence(Part):
     """How fast a cell reaches the reference's final accuracy."""
 
@@ -247,6 +308,7 @@ class Report(Part):
     planned_contrasts: int
     convergence: tuple[Convergence, ...]
     confounds: tuple[VariedSetting, ...] = ()
+    driving: Driving | None = None
     claims: tuple[Verdict, ...]
     rules: dict[str, float | dict[str, float] | dict[str, str] | None]
     settings: tuple[Setting, ...]

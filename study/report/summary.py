@@ -30,6 +30,7 @@ from study.config.baselines import BASELINES, CEILING
 from study.config.heads import HEADS, heads_of
 from study.config.paper import parameter_counts
 from study.products import Arrays
+from study.report.driving import spread, summarise_driving
 from study.report.model import (
     CellCost,
     Convergence,
@@ -89,6 +90,7 @@ def summarise(record: SweepRecord) -> Report:
             if base is not None
         ),
         confounds=tuple(_confounds(record)),
+        driving=summarise_driving(record),
         claims=tuple(
             verdict
             for verdict in claims.judge(record)
@@ -150,22 +152,7 @@ def _baselines(record: SweepRecord) -> tuple[tuple[Score, ...], tuple[float, flo
 def _spread(results: list[CellResult], metric: Metric) -> Spread | None:
     """Return a metric over the policies of some results and, where it is known by drive, over test drives."""
     scores = metrics.scores(results, metric)
-    if scores.empty:
-        return None
-    mean = intervals.crossed(Sample(scores, by_drive(results, metric.name)))
-    interval = mean.estimate()
-    return Spread(
-        mean=interval.value,
-        sd=float(scores.std(ddof=1)) if len(scores) > 1 else math.nan,
-        iqm=float(intervals.interquartile_mean(scores.to_numpy())),
-        low=interval.low,
-        high=interval.high,
-        n=interval.n,
-        kind=interval.kind,
-        units=learning_curves.by_seed(scores).to_dict(),
-        drives=mean.drives,
-        more=mean.more,
-    )
+    return None if scores.empty else spread(Sample(scores, by_drive(results, metric.name)))
 
 
 def _score(record: SweepRecord, point: Point, cell: str, curves: pd.DataFrame, ends: tuple[float, float]) -> Score:

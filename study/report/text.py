@@ -14,13 +14,24 @@ from study.analysis.learning_curves import KEYFRAME
 from study.analysis.metrics import Metric
 from study.config.baselines import BASELINES
 from study.config.heads import HEAD_SETS
-from study.report import rounding
+from study.report import driving, rounding
 from study.report.document import Block, Inline, bold, code, italic, parse, plain, table
 from study.report.model import Report, Score, Spread
 from study.report.rounding import LOSS, NOTHING, UNITS, interval, percent, show, thousands
 
 FURTHER_COLUMNS = 5  # metrics that a page has room for, each with its standard deviation
-ROUNDINGS = ("duration", "epochs", "fixed", "gigabytes", "interval", "kinds", "percent", "points", "probability")
+ROUNDINGS = (
+    "duration",
+    "epochs",
+    "fixed",
+    "gigabytes",
+    "interval",
+    "kinds",
+    "percent",
+    "points",
+    "probability",
+    "scores",
+)
 
 
 def render(template: str, pictures: dict[str, str], **values: object) -> list[Block]:
@@ -45,6 +56,21 @@ def document(report: Report) -> list[Block]:
     )
 
 
+def _driving(report: Report) -> dict[str, Any]:
+    """Return the tables of driving, what their columns mean, and scores in a sentence; nothing where nothing drove."""
+    part = report.driving
+    if not part:
+        return {}
+    return {
+        **driving.driving_words(part),
+        "about": driving.about(part),
+        "scores": driving.score_table(part, part.town),
+        "rates": driving.rate_table(part, part.town),
+        "per_km": driving.per_km_table(part, part.town),
+        "elsewhere": [(place, driving.short_table(part, place)) for place in part.places[1:]],
+    }
+
+
 def _lists(report: Report) -> dict[str, Any]:
     """Return what the text lists: sentences' enumerations, tables by metric, settings by name, labels of each set."""
     sweep = report.sweep
@@ -64,6 +90,7 @@ def _lists(report: Report) -> dict[str, Any]:
         "head_parameters": ", ".join(
             f"{thousands(count)} ({head})" for head, count in report.parameters.items() if head != "encoder"
         ),
+        "wheel": _driving(report),
         "hundredths": partial(percent, digits=2),
         "fractions": ", ".join(f"{round(100 * fraction, 2):g} %" for fraction in sweep.fractions),
         "outcomes": "; ".join(f"{len(names)} {word} ({', '.join(names)})" for word, names in report.outcomes.items()),
