@@ -228,4 +228,5 @@ def test_sweeps_that_both_drove_are_compared_at_the_wheel():
     assert "20 in the first and 20 in the\nsecond" in part or "20 in the first and 20 in the second" in part
     change = float(row(part, "full")[3].removeprefix("+"))
     assert change == pytest.approx(30, abs=4)
+    assert row(part, "expert")[1:4] == ["98.0 (20)", "98.0 (20)", "0.0"]
     assert "At the wheel" not in compared(sides[0], checked(made(still), "b"), ("old", "new"))

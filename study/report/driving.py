@@ -103,7 +103,7 @@ def _spread(scores: DriveScores) -> Spread:
 
 
 def _over_drives(scores: DriveScores) -> Spread:
-    """Return the expert's score: there is one expert, so its interval is over drives alone."""
+    """Return the expert's score: there is one expert, so its units are the drives."""
     values = scores.scores.iloc[0]
     mean = intervals.t_interval(values.to_numpy(), "t, over held-out drives")
     return Spread(
@@ -112,9 +112,9 @@ def _over_drives(scores: DriveScores) -> Spread:
         iqm=float(intervals.interquartile_mean(values.to_numpy())),
         low=mean.low,
         high=mean.high,
-        n=1,
+        n=mean.n,
         kind=mean.kind,
-        units={},
+        units={int(str(drive)): float(value) for drive, value in values.items()},
     )
 
 
