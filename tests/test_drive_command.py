@@ -81,6 +81,7 @@ def test_a_policy_of_a_finished_cell_drives(undisturbed: UndisturbedSweep, monke
     assert main([*words, "--cell", "rec+plan 100% e0", "--seed", "1", "--out", str(out)]) == 0
     assert "rec+plan 100% e0, policy 1" in capsys.readouterr().out
     assert out.stat().st_size > 1000
+    assert main([*words, "--cell", "rec+plan", "--seed", "1"]) == 0
     with pytest.raises(BadInputError, match="unknown finished cell 'reck'; choose from rec 100% e0"):
         main([*words, "--cell", "reck"])
     with pytest.raises(BadInputError, match="unknown policy seed of rec 100% e0 '9'; choose from 0, 1"):

@@ -128,12 +128,17 @@ def judge(recorded: CellResult, again: CellResult, allowance: float) -> Agreemen
 
 
 def choose(finished: Mapping[str, Cell], wanted: str | None, seed: int) -> str:
-    """Return the key of the finished cell of that label or key, or of one drawn from the seed. Raises BadInputError."""
+    """Return the key of the finished cell of that label, key or head set, or of one drawn from the seed.
+
+    Raises BadInputError for a name that no cell has, or several.
+    """
     if wanted is None:
         return random.Random(f"verify {seed}").choice(sorted(finished))  # noqa: S311 - no secret
     for key, cell in finished.items():
         if wanted in (key, cell.label):
             return key
+    if len(named := [key for key, cell in finished.items() if cell.heads == wanted]) == 1:
+        return named[0]
     raise one_of("finished cell", wanted, [cell.label for cell in finished.values()])
 
 
