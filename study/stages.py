@@ -90,10 +90,15 @@ class Task:
 
 @dataclass(frozen=True)
 class Batch:
-    """Tasks of one stage that do not depend on each other; `before`: the weight of what was done earlier."""
+    """Tasks of one stage that do not depend on each other.
+
+    `before`: the weight of what was done earlier; `receive`: called with the number of a task and its result as soon as
+    it is there, so that it can be kept while others run.
+    """
 
     tasks: Sequence[Task]
     before: int = 0
+    receive: Callable[[int, Any], None] = lambda *_: None
 
 
 T = TypeVar("T")

@@ -114,6 +114,28 @@ def test_results_come_back_in_the_order_of_the_tasks(last_first):
 
 
 @pytest.mark.parametrize("counts", [(), (0,), (0, 0), (0, 2), (1, 0), (1, 0, 0, 1)])
+def test_each_result_is_kept_when_it_comes_and_not_when_all_are_there():
+    diary = []
+
+    def flow():
+        tasks = [Task(ENCODER, note, (diary, word)) for word in ("first", "second")]
+        return (yield Batch(tasks, receive=lambda index, word: diary.append(f"kept {index} {word}")))
+
+    events = run({"a": flow()})
+    assert diary == ["first", "kept 0 first", "second", "kept 1 second"]
+    assert events.products == {"a": ["first", "second"]}
+
+
+def test_a_result_that_cannot_be_kept_is_a_failure():
+    def refuse(_, word):
+        raise BadInputError(f"no place for {word}")
+
+    def flow():
+        yield Batch([Task(ENCODER, note, ([], "it"))], receive=refuse)
+
+    assert run({"a": flow()}).failures["a"].reason == "no place for it"
+
+
 def test_an_empty_batch_gives_no_results_and_the_flow_goes_on(counts):
     expected = [f"a{number}{index}" for number, count in enumerate(counts) for index in range(count)]
     assert run({"a": steps([], "a", *counts)}).products == {"a": expected}

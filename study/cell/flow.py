@@ -112,8 +112,11 @@ def _keep(folders: list[Path], parts: tuple[str, ...], tasks: list[Task]) -> Gen
             products[folder] = Product(arrays, curves, head["facts"])
     missing = {folder: task for folder, task in zip(folders, tasks, strict=True) if folder not in products}
     before = sum(task.weight for folder, task in zip(folders, tasks, strict=True) if folder in products)
-    for folder, product in zip(missing, (yield Batch(list(missing.values()), before)), strict=True):
+    left = list(missing)
+
+    def keep(index: int, product: Product) -> None:
         facts = {"facts": product.facts}
-        with_room(partial(write_product, folder, HEAD, facts, product.parts, product.curves))
-        products[folder] = product
+        with_room(partial(write_product, left[index], HEAD, facts, product.parts, product.curves))
+
+    products |= zip(left, (yield Batch(list(missing.values()), before, keep)), strict=True)
     return [products[folder] for folder in folders]

@@ -157,6 +157,8 @@ class _Runner:
     def _end_task(self, attempt: _Attempt, value: Any) -> None:
         running = attempt.running
         if not isinstance(value, Failure):
+            value = self._receive(running.batch, attempt.index, value)
+        if not isinstance(value, Failure):
             self._full.clear()
             running.results[attempt.index] = value
             running.shares[attempt.index] = 1.0
@@ -174,6 +176,18 @@ class _Runner:
                 del self._submitted[number]
             running.flow.close()
             self._listener.failed(running.name, value)
+
+    @staticmethod
+    def _receive(batch: Batch, index: int, value: Any) -> Any:
+        """Have the flow keep a result; returns it, or why that has failed."""
+        try:
+            batch.receive(index, value)
+        except (BadInputError, OSError, RuntimeError) as error:
+            failure = failure_of(error)
+            if not (failure.transient or failure.expected):
+                raise  # a fault of this program
+            return failure
+        return value
 
     def _hear(self, number: int, kind: str, *values: Any) -> None:
         if (attempt := self._submitted.get(number)) is None:
