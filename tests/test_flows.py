@@ -113,7 +113,6 @@ def test_results_come_back_in_the_order_of_the_tasks(last_first):
     assert events.products == {"a": ["a00", "a01", "a02", "a03", "a10", "a11"]}
 
 
-@pytest.mark.parametrize("counts", [(), (0,), (0, 0), (0, 2), (1, 0), (1, 0, 0, 1)])
 def test_each_result_is_kept_when_it_comes_and_not_when_all_are_there():
     diary = []
 
@@ -136,6 +135,7 @@ def test_a_result_that_cannot_be_kept_is_a_failure():
     assert run({"a": flow()}).failures["a"].reason == "no place for it"
 
 
+@pytest.mark.parametrize("counts", [(), (0,), (0, 0), (0, 2), (1, 0), (1, 0, 0, 1)])
 def test_an_empty_batch_gives_no_results_and_the_flow_goes_on(counts):
     expected = [f"a{number}{index}" for number, count in enumerate(counts) for index in range(count)]
     assert run({"a": steps([], "a", *counts)}).products == {"a": expected}

@@ -88,7 +88,7 @@ class Rules(Settings):
         2.0, description="smallest difference in driving score (0 to 100) that matters; of claims that are ours"
     )
     driving_effect: Positive = Field(
-        5.0, description="true difference in driving score for which a finding's power is stated"
+        10.0, description="true difference in driving score for which a finding's power is stated"
     )
     driving_allowance: NotNegative = Field(
         5.0,
