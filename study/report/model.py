@@ -91,7 +91,20 @@ class Spread(Part):
     more: float = 0.0
 
 
-class Score(Part):
+class OfCell(Part):
+    """What is known of a cell or a baseline, by the name of its row."""
+
+    cell: str
+    heads: str
+    fraction: float
+
+    @property
+    def point(self) -> Point:
+        """Return head set and fraction."""
+        return (self.heads, self.fraction)
+
+
+class Score(OfCell):
     """What is known of a finished cell.
 
     `metrics`: final scores by name of the metric; `gain`: accuracy above the best trivial baseline; `share`: its part
@@ -102,9 +115,6 @@ class Score(Part):
     linear model reads off the latents, mean over encoders.
     """
 
-    cell: str
-    heads: str
-    fraction: float
     encoders: int
     n: int
     metrics: dict[str, Spread]
@@ -116,17 +126,12 @@ class Score(Part):
     probes: dict[str, Number]
 
     @property
-    def point(self) -> Point:
-        """Return head set and fraction."""
-        return (self.heads, self.fraction)
-
-    @property
     def accuracy(self) -> Spread:
         """Return the accuracy of acceleration, which most figures and claims are about."""
         return self.metrics[learning_curves.ACCURACY]
 
 
-class DrivingScore(Part):
+class DrivingScore(OfCell):
     """What the policies of a cell, or the expert, did at the wheel in one place.
 
     `policies`: how many drove, each the same `drives`; `metrics`: means over drives by name (driving.SCORES); `rates`:
@@ -134,20 +139,12 @@ class DrivingScore(Part):
     each of ENDS has ended.
     """
 
-    cell: str
-    heads: str
-    fraction: float
     policies: int
     drives: int
     metrics: dict[str, Spread]
     rates: dict[str, Interval]
     per_km: dict[str, Number]
     ended: dict[str, float]
-
-    @property
-    def point(self) -> Point:
-        """Return head set and fraction."""
-        return (self.heads, self.fraction)
 
 
 class DrivingPlace(Part):
@@ -187,12 +184,9 @@ class Driving(Part):
         return self.places[0]
 
 
-class Convergence(Part):
+class Convergence(OfCell):
     """How fast a cell reaches the reference's final accuracy."""
 
-    cell: str
-    fraction: float
-    heads: str
     target: float
     mean_curve: Interval
     median: Number
