@@ -18,7 +18,7 @@ from study.errors import BadInputError
 from study.randomness import rng
 from study.sim.autopilot import MOST_STEERING, REACH, Decisions, Fleet
 from study.sim.dynamics import BRAKE, DT, LOOK, THROTTLE, TOP_SPEED, check_dynamics, follow_command
-from study.sim.geometry import LENGTH, Pose
+from study.sim.geometry import LENGTH, Floats, Pose
 from study.sim.lights import LightPlan, plan_lights
 from study.sim.road import TownNetwork, TownRoad, TownVehicle
 from study.sim.town import Town, draw_town
@@ -67,7 +67,7 @@ class Traffic(TownRoad):
         self.lengths = np.array([piece.length for piece in pieces])
         for slot in range(settings.vehicles):
             self._enter(slot)
-        self._follow()
+        self._follow(self.pose())
 
     @property
     def time(self) -> float:
@@ -95,8 +95,8 @@ class Traffic(TownRoad):
             self.vehicles.append(vehicle)
             self.agents.append(slot)
 
-    def _follow(self) -> None:
-        x, y, _, _ = self.pose()
+    def _follow(self, pose: Pose) -> None:
+        x, y, _, _ = pose
         self.fleet.follow(x, y)
 
     def decide(self) -> Decisions:
@@ -122,10 +122,15 @@ class Traffic(TownRoad):
         self.force = np.maximum(force, -speed / DT)  # never backwards
         wheel = -decisions.steering * self.dynamics.steering_unit
         self.wheel = follow_command(self.wheel, wheel, self.dynamics.wheel_lag)
-        for vehicle, acceleration, steering in zip(
-            self.vehicles, self.force.tolist(), self.wheel.tolist(), strict=True
-        ):
-            vehicle.act({"acceleration": acceleration, "steering": steering})
+        if not self.fast:
+            for vehicle, force_now, wheel_now in zip(
+                self.vehicles, self.force.tolist(), self.wheel.tolist(), strict=True
+            ):
+                vehicle.act({"acceleration": force_now, "steering": wheel_now})
+
+    def controls(self) -> tuple[Pose, Floats, Floats]:
+        """Return what `TownRoad.controls` does, without asking every vehicle."""
+        return self.decided_pose if self.decided == self.steps else self.pose(), self.force, self.wheel
 
     def step(self, dt: float) -> None:
         """Move all vehicles by `dt` [s]; a new vehicle replaces each that has crashed, elsewhere."""
@@ -138,7 +143,7 @@ class Traffic(TownRoad):
             self.crash_pose = self.pose()
         for slot in self.crashed:
             self._enter(slot)
-        self._follow()
+        self._follow(self.moved if self.fast and not self.crashed else self.pose())
 
 
 class TownAction(ActionType):

@@ -201,33 +201,40 @@ class TownRoad(Road):
         if not self.fast:
             super().step(dt)
             return
-        pose = self._move(dt)
-        for i, j in zip(*self._touching(pose, dt), strict=True):
+        self.moved = self._move(dt)
+        for i, j in zip(*self._touching(self.moved, dt), strict=True):
             self.vehicles[i].handle_collisions(self.vehicles[j], dt)
+
+    def controls(self) -> tuple[Pose, Floats, Floats]:
+        """Return the pose of all vehicles, and the acceleration [m/s2] and the wheel angle [rad] that act on them."""
+        push, steering = (
+            np.array([vehicle.action[name] for vehicle in self.vehicles], np.float64)
+            for name in ("acceleration", "steering")
+        )
+        return self.pose(), push, steering
 
     def _move(self, dt: float) -> Pose:
         """Do `Vehicle.step` for all vehicles, and return their new pose."""
-        x, y, heading, speed = self.pose()
-        steering = np.array([vehicle.action["steering"] for vehicle in self.vehicles], np.float64)
-        push = np.array([vehicle.action["acceleration"] for vehicle in self.vehicles], np.float64)
+        (x, y, heading, speed), push, steering = self.controls()
         odd = [
             k
             for k, vehicle in enumerate(self.vehicles)
             if vehicle.crashed or vehicle.impact is not None or abs(vehicle.speed) > vehicle.MAX_SPEED
         ]
         for k in odd:
+            self.vehicles[k].act({"acceleration": float(push[k]), "steering": float(steering[k])})
             self.vehicles[k].step(dt)
         beta = np.arctan(1 / 2 * np.tan(steering))
         course = heading + beta
-        place = np.stack([x + speed * np.cos(course) * dt, y + speed * np.sin(course) * dt], axis=1)
+        x, y = x + speed * np.cos(course) * dt, y + speed * np.sin(course) * dt
         heading = heading + speed * np.sin(beta) / (TownVehicle.LENGTH / 2) * dt
         speed = speed + push * dt
-        rows = zip(self.vehicles, place, heading.tolist(), speed.tolist(), strict=True)
+        rows = zip(self.vehicles, np.stack([x, y], axis=1), heading.tolist(), speed.tolist(), strict=True)
         for k, (vehicle, position, angle, velocity) in enumerate(rows):
             if k not in odd:
                 vehicle.position, vehicle.heading, vehicle.speed = position, angle, velocity
-                vehicle.on_state_update()
-        return self.pose() if odd else (place[:, 0], place[:, 1], heading, speed)
+                vehicle._lane_index = None  # noqa: SLF001 - its own kind; a call of `on_state_update` would cost more
+        return self.pose() if odd else (x, y, heading, speed)
 
     def _touching(self, pose: Pose, dt: float) -> tuple[Ints, Ints]:
         """Return the pairs i < j that may touch within `dt`: no axis of the two moving boxes separates them."""
