@@ -2,6 +2,7 @@
 
 import hashlib
 import shutil
+import socket
 import sqlite3
 from contextlib import closing
 from pathlib import Path
@@ -11,7 +12,8 @@ import pytest
 from study.errors import BadInputError
 from study.report import __main__ as report
 from study.sweep import __main__ as sweep
-from study.tracking.experiment import SQLITE
+from study.tracking import schema
+from study.tracking.experiment import SQLITE, TrackerLostError, find_experiment
 from study.tracking.schema import _versions, has_tables
 from study.tracking.tracker import Tracker
 
@@ -94,3 +96,14 @@ def test_an_empty_database_of_another_host_has_no_tables_yet(tmp_path):
     """SQLite stands for PostgreSQL: both are asked in the same words."""
     assert has_tables(f"sqlite:///{tmp_path}/empty.db", "shown", None) is False
     assert len(_versions()) > 10
+
+
+@pytest.mark.parametrize("asked", ["", "?connect_timeout=2"])
+def test_a_database_that_does_not_answer_is_not_waited_for_in_silence(asked, monkeypatch):
+    pytest.importorskip("psycopg")
+    if not asked:
+        monkeypatch.setitem(schema.CONNECT, "connect_timeout", 2)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        uri = f"postgresql+psycopg://127.0.0.1:{silent.getsockname()[1]}/mlflow{asked}"
+        with pytest.raises(TrackerLostError, match=r"timeout expired.*start it, or choose another with --tracking"):
+            find_experiment(uri, "study")

@@ -8,12 +8,13 @@ from pathlib import Path
 
 import mlflow
 from alembic.script import ScriptDirectory  # MLflow depends on alembic and on sqlalchemy
-from sqlalchemy import create_engine, inspect, text
+from sqlalchemy import create_engine, inspect, make_url, text
 from sqlalchemy.pool import NullPool
 
 from study.errors import BadInputError
 
 MIGRATIONS = Path(mlflow.__file__).parent / "store" / "db_migrations"
+CONNECT = {"connect_timeout": 10}  # [s]; left alone, PostgreSQL waits in silence for minutes
 
 
 def has_tables(uri: str, shown: str, database: Path | None) -> bool:
@@ -25,7 +26,9 @@ def has_tables(uri: str, shown: str, database: Path | None) -> bool:
         connect = partial(sqlite3.connect, f"{database.as_uri()}?mode=ro", uri=True, timeout=20)
         engine = create_engine("sqlite://", creator=connect, poolclass=NullPool)
     else:
-        engine = create_engine(uri, poolclass=NullPool)
+        url = make_url(uri)
+        patient = url.get_backend_name() != "postgresql" or "connect_timeout" in url.query
+        engine = create_engine(url, poolclass=NullPool, connect_args={} if patient else CONNECT)
     with engine.connect() as connection:
         tables = set(inspect(connection).get_table_names())
         if not tables and not database:
