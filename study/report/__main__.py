@@ -3,6 +3,7 @@
 python -m study.report heads
 python -m study.report datasize --profile smoke --tracking http://127.0.0.1:5000
 python -m study.report heads --format md > heads.md
+python -m study.report heads --format latex > tables.tex
 python -m study.report compare reports/reference/heads heads:laptop@http://127.0.0.1:5000 --figure both.svg
 """
 
@@ -26,17 +27,18 @@ HINT = (
 @click.command(epilog="python -m study.report compare A B sets two sweeps side by side; see its --help")
 @click.argument("name", metavar="SWEEP")
 @click.option("--profile", metavar="P", help="of the sweep [that of its latest run]")
-@click.option("--format", "kind", type=click.Choice(["pdf", "md"]), default="pdf", show_default=True)
+@click.option("--format", "kind", type=click.Choice(["pdf", "md", "latex"]), default="pdf", show_default=True)
 @click.option("--out", type=Path, default=HERE.reports, metavar="DIR", show_default=True)
 @tracking_option()
 def report(name: str, profile: str | None, kind: str, out: Path, tracking: str) -> int:
     """Write the report of SWEEP from what MLflow holds: PDF, figures, numbers and the tidy table.
 
-    With --format md, print the report without figures as Markdown. Exit code 1: the result of a finished cell is lost.
+    With --format md, print the report without figures as Markdown; with --format latex, its tables for a paper. Exit
+    code 1: the result of a finished cell is lost.
     """
     reader = resolve_name("study.tracking.reader:Reader").existing(tracking)
-    if kind == "md":
-        text, code = resolve_name("study.report.build:report_as_markdown")(reader, name, profile)
+    if kind != "pdf":
+        text, code = resolve_name("study.report.build:report_as_text")(reader, name, profile, kind)
         print(text, end="")
     else:
         tracker = resolve_name("study.tracking.tracker:Tracker")(tracking)  # the report becomes part of the run
@@ -55,13 +57,14 @@ def report(name: str, profile: str | None, kind: str, out: Path, tracking: str) 
     help="draw accuracy and differences to the reference of both sweeps into FILE (.svg, .png or .pdf); the Markdown "
     "shows it by its path from the working folder",
 )
+@click.option("--format", "kind", type=click.Choice(["md", "latex"]), default="md", show_default=True)
 @tracking_option()
-def compare(first: str, second: str, figure: Path | None, tracking: str) -> int:
-    """Set two sweeps side by side, as Markdown on stdout.
+def compare(first: str, second: str, figure: Path | None, kind: str, tracking: str) -> int:
+    """Set two sweeps side by side on stdout: as Markdown, or the tables alone as LaTeX.
 
     A and B: each a report.json, a folder that holds one, or NAME[:PROFILE][@URI] of a sweep in MLflow.
     """
-    text, code = resolve_name("study.report.build:side_by_side")(first, second, tracking, figure)
+    text, code = resolve_name("study.report.build:side_by_side")(first, second, tracking, figure, kind)
     print(text, end="")
     return int(code)
 

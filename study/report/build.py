@@ -19,6 +19,7 @@ from study.figures.style import METADATA, save, write
 from study.report.comparison import compare
 from study.report.document import Block
 from study.report.drawings import draw, draw_sweeps
+from study.report.latex import latex
 from study.report.markdown import markdown
 from study.report.model import Report, read_report
 from study.report.summary import summarise
@@ -102,16 +103,23 @@ def _say_unread(record: SweepRecord) -> None:
         print(f"left out of the report: {line}", file=sys.stderr)
 
 
-def report_as_markdown(reader: Reader, name: str, profile: str | None) -> tuple[str, int]:
-    """Return the report of a sweep as Markdown, without figures, and the exit code."""
+def report_as_text(reader: Reader, name: str, profile: str | None, kind: str) -> tuple[str, int]:
+    """Return the report of a sweep without figures, as "md" or its tables as "latex", and the exit code."""
     record = complete_cells(reader, name, profile)
-    return markdown(document(summarise(record))), exit_code(record)
+    return _text(document(summarise(record)), record.grid.name, kind), exit_code(record)
 
 
-def side_by_side(first: str, second: str, tracking: str, figure: Path | None = None) -> tuple[str, int]:
-    """Return two sweeps' comparison as Markdown, and the exit code; each is a path or NAME[:PROFILE][@URI].
+def _text(blocks: Sequence[Block], name: str, kind: str) -> str:
+    return latex(blocks, name) if kind == "latex" else markdown(blocks)
 
-    Both are drawn into `figure` first, where there is one. Raises BadInputError for what cannot be read or written.
+
+def side_by_side(
+    first: str, second: str, tracking: str, figure: Path | None = None, kind: str = "md"
+) -> tuple[str, int]:
+    """Return two sweeps' comparison, as "md" or its tables as "latex", and the exit code.
+
+    Each is a path or NAME[:PROFILE][@URI]. Both are drawn into `figure` first, where there is one. Raises BadInputError
+    for what cannot be read or written.
     """
     if figure:
         _check_figure(figure)
@@ -123,8 +131,8 @@ def side_by_side(first: str, second: str, tracking: str, figure: Path | None = N
                 write(draw_sweeps(*sides, names), figure)
         except OSError as error:
             raise BadInputError(f"cannot write {figure}: {error.strerror}; name another file") from error
-    text = markdown(compare(*sides, names, Path(os.path.relpath(figure)).as_posix() if figure else ""))
-    return text, max(code for _, code in read)
+    blocks = compare(*sides, names, Path(os.path.relpath(figure)).as_posix() if figure else "")
+    return _text(blocks, "-".join(name.partition("@")[0] for name in names), kind), max(code for _, code in read)
 
 
 def _check_figure(file: Path) -> None:
