@@ -32,8 +32,6 @@ AHEAD, BEHIND = 70.0, 10.0  # length of path that is kept at least, before and b
 GAP = 7.5  # of street that a waiting vehicle takes [m]
 AT_LINE = 5.0  # a vehicle this near to its stop line is the first of its queue [m]
 NEVER = 2**62  # a step beyond every drive
-_AROUND = np.arange(-3, 7)  # samples among which a vehicle finds its place
-_AHEAD = np.arange(2, round((LOOK + LENGTH / 2 + 2) / SPACING), 2)  # samples before which others are looked for
 GAP_MARGIN = 0.8  # by which a turning vehicle leaves the crossing lane before the other arrives [s]
 
 
@@ -184,9 +182,8 @@ class Fleet:
         """Locate every vehicle on its planned path, and plan ahead."""
         rows = np.arange(len(x))
         near = (self.s / SPACING).astype(np.int64) - self.first
-        window = np.maximum(near[:, None] + _AROUND, 0)
-        samples = window + rows[:, None] * SAMPLES
-        dx, dy = x[:, None] - self.x.take(samples), y[:, None] - self.y.take(samples)
+        window = (near[:, None] + np.arange(-3, 7)).clip(0)
+        dx, dy = x[:, None] - self.x[rows[:, None], window], y[:, None] - self.y[rows[:, None], window]
         best = (dx * dx + dy * dy).argmin(axis=1)
         k = window[rows, best]
         dx, dy, heading = dx[rows, best], dy[rows, best], self.heading[rows, k]
@@ -288,8 +285,8 @@ class Fleet:
         middle = near + round(17 / SPACING)
         close = np.hypot(x[j] - self.x[rows, middle][i], y[j] - self.y[rows, middle][i]) < 20.5
         i, j = i[close], j[close]
-        window = near[:, None] + _AHEAD
-        px, py = (values.take(window + rows[:, None] * SAMPLES) for values in (self.x, self.y))
+        window = near[:, None] + np.arange(2, round((LOOK + LENGTH / 2 + 2) / SPACING), 2)
+        px, py = self.x[rows[:, None], window], self.y[rows[:, None], window]
         dx, dy = px[i] - x[j][:, None], py[i] - y[j][:, None]
         c, s = np.cos(heading)[j][:, None], np.sin(heading)[j][:, None]
         along = np.maximum(np.abs(dx * c + dy * s) - LENGTH / 2, 0)
