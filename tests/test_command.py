@@ -53,7 +53,10 @@ def folder(tmp_path_factory):
             "it goes with python -m study.sweep, python -m study.sweep train: leave",
         ),
         (["verify", "heads", "--workers", "2"], "no cell of heads"),
-        (["status", "heads", "--cell", "x"], "it goes with python -m study.sweep verify: leave it out here"),
+        (
+            ["status", "heads", "--cell", "x"],
+            "python -m study.sweep verify, python -m study.sweep drive: leave it out here",
+        ),
         (["train", "heads", "--out", "out", "--tracking", "x"], "it goes with python -m study.sweep, "),
         ([], "NAME"),
     ],
