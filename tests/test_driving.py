@@ -42,6 +42,10 @@ DRIVE = Drive(2_000_001, 0, 12.0)
 POLICIES = 3
 
 
+def lasting(seconds: float) -> StudySettings:
+    return SETTINGS.model_copy(update={"driving": DrivingSettings(duration=seconds)})
+
+
 def still(seen: Observation) -> tuple[float, int]:
     return 0.0, 0
 
@@ -165,7 +169,7 @@ def test_held_out_drives_are_none_of_the_recorded_ones() -> None:
     recording = SETTINGS.recording
     recorded = {recording.seed + k for k in range(recording.encoder_episodes)}
     recorded |= {recording.seed + POLICY_SEED + k for k in range(recording.policy_episodes)}
-    here, unseen = (held_out_drives(SETTINGS, unseen_towns=unseen) for unseen in (False, True))
+    here, unseen = (held_out_drives(SETTINGS, 20, unseen_towns=unseen) for unseen in (False, True))
     assert len({drive.seed for drive in (*here, *unseen)} | recorded) == 40 + len(recorded)
     assert {drive.town_seed for drive in here} == {recording.seed}
     assert len({drive.town_seed for drive in unseen}) == 20
@@ -183,7 +187,7 @@ def scores_of(actor: FunctionActor | Expert, drive: Drive, settings: StudySettin
 
 @pytest.mark.parametrize("unseen_towns", [False, True])
 def test_the_expert_drives_without_fault(unseen_towns: bool) -> None:
-    for drive in held_out_drives(SETTINGS, 2, 25.0, unseen_towns=unseen_towns):
+    for drive in held_out_drives(lasting(25.0), 2, unseen_towns=unseen_towns):
         scores = scores_of(Expert(), drive)
         assert scores.route_completion == 1
         assert scores.driving_score == 100
@@ -211,7 +215,7 @@ def test_a_still_actor_is_blocked() -> None:
 
 
 def test_a_blind_actor_at_full_throttle_collides_or_runs_reds_or_leaves_its_way() -> None:
-    drives = held_out_drives(SETTINGS, 4, 30.0)
+    drives = held_out_drives(lasting(30.0), 4)
     scores = [scores_of(FunctionActor(blind), drive) for drive in drives]
     assert not any(score.success for score in scores)
     assert sum(score.collision + score.red_lights for score in scores) > 0

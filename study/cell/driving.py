@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import asdict, replace
 from typing import Any
@@ -77,13 +76,11 @@ def _first_policies(result: CellResult, count: int) -> CellResult:
 def _drive(
     actor: Actor, drives: Drives, settings: StudySettings, ways: dict[int, float], seeds: Collection[int]
 ) -> Product:
-    started = time.perf_counter()
     rows: list[dict[str, Any]] = []
     for place, drive in drives:
         episodes = rollout(drive, actor, settings)
         rows += _rows(place, drive, zip(seeds, episodes, strict=True), ways)
-    facts = {"seconds": time.perf_counter() - started, "steps": int(sum(row["time"] for row in rows) * 10)}
-    return Product({}, pd.DataFrame(rows), facts)
+    return Product({}, pd.DataFrame(rows), {})
 
 
 def _rows(

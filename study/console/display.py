@@ -99,6 +99,10 @@ class Display:
         self._state[key] = f"{kind.activity}, {kind.unit} {done:,}/{total:,}" if total > 1 else kind.activity
         self.tick()
 
+    def retry(self, key: str, reason: str) -> None:
+        """Say that a task of a cell will be tried again, and why."""
+        self.say(f"{self._labels[key]}: {reason.strip().splitlines()[-1]}; it will be tried again")
+
     def finish(self, key: str) -> None:
         """Say that a cell is committed."""
         self._finished += 1

@@ -11,7 +11,7 @@ from PIL import Image as Pillow
 from PIL import ImageDraw, ImageFont
 
 from study.config.paper import ACCELERATIONS, IMAGE
-from study.data.targets import FRACTION_BITS, Floats, fixed_point
+from study.data.targets import FRACTION_BITS, Floats, corners, fixed_point
 from study.episode.schema import Episode
 from study.figures.style import BLUE, FRACTION_COLOUR, GREY, VERMILION
 
@@ -125,12 +125,8 @@ class Scene:
 
     def _boxes(self, poses: Floats, affine: Floats, agents: list[int]) -> NDArray[np.int32]:
         """Return the boxes [N, 4, 2] of agents at poses [N, 3] in fixed-point pixels."""
-        half = np.array([(self.episode.agents[agent].length, self.episode.agents[agent].width) for agent in agents]) / 2
-        along = np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], axis=1)
-        across = np.stack([-along[:, 1], along[:, 0]], axis=1)
-        front, side = half[:, :1] * along, half[:, 1:] * across
-        corners = np.stack([front + side, front - side, -front - side, side - front], axis=1) + poses[:, None, :2]
-        return fixed_point(corners.reshape(-1, 2), affine).reshape(-1, 4, 2)
+        sizes = np.array([(self.episode.agents[agent].length, self.episode.agents[agent].width) for agent in agents])
+        return fixed_point(corners(poses, *sizes.T).reshape(-1, 2), affine).reshape(-1, 4, 2)
 
     def _words(self, step: int, command: int) -> Image:
         """Return the words below a frame: time, speed, steering, acceleration and light."""

@@ -77,3 +77,15 @@ def fixed_point(points: Floats, affine: Floats) -> Polygon:
     """Return world points [..., 2] [m] as the fixed-point pixel coordinates of cv2."""
     fixed: Polygon = np.rint((points @ affine[:, :2].T + affine[:, 2]) * (1 << FRACTION_BITS)).astype(np.int32)
     return fixed
+
+
+def corners(pose: Floats, length: float | Floats, width: float | Floats) -> Floats:
+    """Return the corners [..., 4, 2] m of boxes with poses [..., 3 or more]: x, y, heading; the front's come first.
+
+    `length` and `width` [m] are of all boxes, or of each [...].
+    """
+    x, y, heading = (pose[..., k, None] for k in range(3))
+    along = np.array([1, 1, -1, -1]) * np.asarray(length)[..., None] / 2
+    aside = np.array([1, -1, -1, 1]) * np.asarray(width)[..., None] / 2
+    c, s = np.cos(heading), np.sin(heading)
+    return np.stack([x + along * c - aside * s, y + along * s + aside * c], axis=-1)

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from study.analysis.comfort import comfortable
+from study.data.targets import corners
 from study.driving.faults import at_fault
-from study.driving.surface import corners, off_road
+from study.driving.surface import off_road
 from study.episode.schema import RED, Episode
 
 VEHICLE, LAYOUT, RED_LIGHT = 0.60, 0.65, 0.70  # penalties of the CARLA leaderboard, for each infraction

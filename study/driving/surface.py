@@ -14,15 +14,6 @@ Floats = NDArray[np.float64]
 CHUNK = 256  # points whose distances are computed together
 
 
-def corners(pose: Floats, length: float, width: float) -> Floats:
-    """Return the corners [..., 4, 2] m of boxes with poses [..., 3 or more]: x, y, heading; the front's come first."""
-    x, y, heading = (pose[..., k, None] for k in range(3))
-    along = np.array([1, 1, -1, -1]) * length / 2
-    aside = np.array([1, -1, -1, 1]) * width / 2
-    c, s = np.cos(heading), np.sin(heading)
-    return np.stack([x + along * c - aside * s, y + along * s + aside * c], axis=-1)
-
-
 def off_road(points: Floats, lanes: Sequence[Lane], most: float) -> NDArray[np.bool_]:
     """Return whether points [P, 2] lie more than `most` [m] beyond the edge of every lane.
 

@@ -8,7 +8,7 @@ from functools import partial
 
 import pandas as pd
 
-from study.analysis import driving, effects, intervals, learning_curves
+from study.analysis import driving, effects, intervals
 from study.analysis.drives import DriveScores
 from study.analysis.driving import ENDS, PER_KM, RATES, SCORES
 from study.analysis.intervals import Sample
@@ -20,27 +20,10 @@ from study.figures.style import Drawing
 from study.report.document import Inline, italic, plain, table
 from study.report.model import Driving, DrivingPlace, DrivingScore, Spread
 from study.report.rounding import fixed, interval, show
+from study.report.spread import spread, spread_of
 from study.results.sweep_record import SweepRecord
 
 EXPERT = "expert"
-
-
-def spread(sample: Sample) -> Spread:
-    """Return scores over policies or encoders and, where they are known by drive, over drives."""
-    mean = intervals.crossed(sample)
-    estimate, scores = mean.estimate(), pd.Series(sample.values)
-    return Spread(
-        mean=estimate.value,
-        sd=float(scores.std(ddof=1)) if len(scores) > 1 else math.nan,
-        iqm=float(intervals.interquartile_mean(scores.to_numpy())),
-        low=estimate.low,
-        high=estimate.high,
-        n=estimate.n,
-        kind=estimate.kind,
-        units=learning_curves.by_seed(scores).to_dict(),
-        drives=mean.drives,
-        more=mean.more,
-    )
 
 
 def summarise_driving(record: SweepRecord) -> Driving | None:
@@ -105,17 +88,7 @@ def _spread(scores: DriveScores) -> Spread:
 def _over_drives(scores: DriveScores) -> Spread:
     """Return the expert's score: there is one expert, so its units are the drives."""
     values = scores.scores.iloc[0]
-    mean = intervals.t_interval(values.to_numpy(), "t, over held-out drives")
-    return Spread(
-        mean=mean.value,
-        sd=float(values.std(ddof=1)) if len(values) > 1 else math.nan,
-        iqm=float(intervals.interquartile_mean(values.to_numpy())),
-        low=mean.low,
-        high=mean.high,
-        n=mean.n,
-        kind=mean.kind,
-        units={int(str(drive)): float(value) for drive, value in values.items()},
-    )
+    return spread_of(values, intervals.t_interval(values.to_numpy(), "t, over held-out drives"), values)
 
 
 # --- tables ---------------------------------------------------------------------------------------------------------

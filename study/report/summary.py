@@ -30,7 +30,7 @@ from study.config.baselines import BASELINES, CEILING
 from study.config.heads import HEADS, heads_of
 from study.config.paper import parameter_counts
 from study.products import Arrays
-from study.report.driving import spread, summarise_driving
+from study.report.driving import summarise_driving
 from study.report.model import (
     CellCost,
     Convergence,
@@ -46,6 +46,7 @@ from study.report.model import (
     VariedSetting,
 )
 from study.report.scale import training_scale
+from study.report.spread import spread
 from study.results.cell_result import CellResult
 from study.results.sweep_record import SweepRecord
 from study.stages import RESULT_BYTES, data_cost

@@ -76,7 +76,7 @@ class Committing:
             self.started,
             lambda name, device: self._runs[name].note(device=device),
             lambda name, *epoch: self._runs[name].log(*epoch),
-            self.retry,
+            self._display.retry,
             self.tick,
         )
 
@@ -92,10 +92,6 @@ class Committing:
         if name in self._runs:
             self._runs[name].progress(stage, done, total)
             self._display.progress(name, stage, done, total)
-
-    def retry(self, name: str, reason: str) -> None:
-        """Say that a task will be tried again."""
-        self._display.say(f"{self._plan.cells[name].label}: {reason.strip().splitlines()[-1]}; it will be tried again")
 
     def finished(self, name: str, value: tuple[CellResult, bytes]) -> None:
         """Commit a result."""

@@ -71,9 +71,9 @@ def drive(plan: Plan, tracking: str, choice: Choice, out: Path | None) -> int:
     """Drive, print the scores next to the expert's in the same drive, write the film, and return the exit code."""
     if out:
         check_suffix(out)
-    actor, seconds = choose_actor(plan, tracking, choice), plan.settings.driving.duration
+    actor = choose_actor(plan, tracking, choice)
     number = choice.town if choice.town is not None else choice.traffic or 0
-    chosen = held_out_drives(plan.settings, number + 1, seconds, unseen_towns=choice.town is not None)[number]
+    chosen = held_out_drives(plan.settings, number + 1, unseen_towns=choice.town is not None)[number]
     expert = _rollout(plan, chosen, Expert(), 0)
     episode = expert if isinstance(actor, Expert) else _rollout(plan, chosen, actor, choice.seed if choice.cell else 0)
     best, scores = (score_drive(each, progress(expert)) for each in (expert, episode))

@@ -57,12 +57,9 @@ class _Driving:
         display = self._display
         with display:
             self._expert = run_flow(expert_flow(self._plan.settings, self._drives, products), engine)
-            listener = Listener(self._finished, self._fail, display.progress, tick=display.tick, retry=self._retry)
+            listener = Listener(self._finished, self._fail, display.progress, tick=display.tick, retry=display.retry)
             run_flows(engine, self._next, listener)
         return self._failed
-
-    def _retry(self, key: str, reason: str) -> None:
-        self._display.say(f"{self._plan.cells[key].label}: {reason.strip().splitlines()[-1]}; it will be tried again")
 
     def _next(self) -> tuple[str, Flow[tuple[pd.DataFrame, dict[str, bytes]]]] | None:
         while self._left:
