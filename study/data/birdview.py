@@ -129,6 +129,7 @@ class Renderer:
     def _take(self, episode: Episode) -> None:
         self.episode = episode
         self._sizes = np.array([(agent.length, agent.width) for agent in episode.agents]).reshape(-1, 2)
+        self._reach = np.hypot(*self._sizes.T).max(initial=0) / 2 + 1  # of a box from its centre, with a metre to spare
         self._routes = [
             (np.concatenate([[0.0], np.hypot(*np.diff(route, axis=0).T).cumsum()]), *route.T.astype(np.float64))
             if len(route) > 1
@@ -215,26 +216,29 @@ class Renderer:
         middle = (np.einsum("mij,mi->mj", affines[:, :, :2], centre) / scale**2).astype(np.float32)
         east = episode.x[steps] - middle[:, 0, None, None]
         north = episode.y[steps] - middle[:, 1, None, None]
-        reach = np.hypot(*self._sizes.T).max(initial=0) / 2 + 1
-        near = east * east + north * north < np.float32(self.settings.view / 2**0.5 + reach) ** 2  # NaN is never near
+        near = east * east + north * north < np.float32(self.settings.view / 2**0.5 + self._reach) ** 2  # never: NaN
         near &= episode.present[steps] & inside[..., None]
-        frame, pose, agent = np.nonzero(near)
+        place = near.ravel().nonzero()[0]  # much faster than `nonzero` of the table
+        row, agent = np.divmod(place, near.shape[2])
+        frame, pose = np.divmod(row, near.shape[1])
         step = steps[frame, pose]
 
-        at = np.stack([episode.x[step, agent], episode.y[step, agent], np.ones(len(step))], axis=1)
+        at = np.ones((len(step), 3))
+        at[:, 0], at[:, 1] = episode.x[step, agent], episode.y[step, agent]
         column, row = np.einsum("kij,kj->ik", affines[frame], at)
-        margin = reach * scale
+        margin = self._reach * scale
         seen = (column > -margin) & (column < size + margin) & (row > -margin) & (row < size + margin)
         frame, pose, agent, step, column, row = (v[seen] for v in (frame, pose, agent, step, column, row))
 
         turn = episode.heading[step, agent] - heading[frame]
         # cv2 fills a pixel whose centre lies up to half a pixel outside: boxes are made that much smaller.
         half = self._sizes[agent] * (scale / 2) - 0.5
-        along = np.stack([-np.sin(turn), -np.cos(turn)], axis=1) * half[:, :1]
-        across = np.stack([-np.cos(turn), np.sin(turn)], axis=1) * half[:, 1:]
-        front, back = along + across, along - across
-        middles = np.stack([column, row], axis=1)[:, None]
-        corners = middles + np.stack([front, back, -front, -back], axis=1)
+        sine, cosine, corners = np.sin(turn), np.cos(turn), np.empty((len(turn), 4, 2))
+        for axis, middle, along, across in ((0, column, -sine, -cosine), (1, row, -cosine, sine)):
+            along, across = along * half[:, 0], across * half[:, 1]
+            front, back = along + across, along - across
+            for corner, shift in enumerate((front, back, -front, -back)):
+                corners[:, corner, axis] = middle + shift
         fixed = np.rint(corners * (1 << FRACTION_BITS)).astype(np.int32)
 
         # A pose that stands where the next younger one stands is painted over by it: leave it out.

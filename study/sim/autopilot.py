@@ -190,16 +190,16 @@ class Fleet:
         c, s = np.cos(heading), np.sin(heading)
         self.s = (self.first + k) * SPACING + dx * c + dy * s
         self.lateral = dy * c - dx * s
-        for slot in np.flatnonzero(self.s > self.strip_end).tolist():
+        for slot in (self.s > self.strip_end).nonzero()[0].tolist():
             self.load[self.strip[slot]] -= 1
             self.at[slot] += 1
             self._stand_on(slot)
-        for slot in np.flatnonzero(self.s - LENGTH / 2 > self.move_end).tolist():
+        for slot in (self.s - LENGTH / 2 > self.move_end).nonzero()[0].tolist():
             self._next_turn(slot)
             self.running[slot] = self.stopping[slot] = self.held[slot] = False
             self.denied[slot] = NEVER
         short = (self.first + self.filled) * SPACING < self.s + AHEAD
-        for slot in np.flatnonzero(short | (self.strip_end + 40 > self.ends)).tolist():
+        for slot in (short | (self.strip_end + 40 > self.ends)).nonzero()[0].tolist():
             self._lengthen(slot)
 
     def ahead(self, values: Floats, distance: Floats) -> Floats:
@@ -335,7 +335,7 @@ class Fleet:
         self.since = np.where(inside, np.minimum(self.since, step), step)
         goes = inside | self.running | ((state == GREEN) & ~self.held)
         waits = (self.move >= 0) & (front > -45)
-        one, other = np.flatnonzero(waits), np.flatnonzero(waits & goes)
+        one, other = waits.nonzero()[0], (waits & goes).nonzero()[0]
         table = town.enter[self.move[one][:, None], self.move[other][None]]
         rows, columns = true_pairs(~np.isnan(table))
         i, j = one[rows], other[columns]

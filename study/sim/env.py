@@ -137,7 +137,7 @@ class Traffic(TownRoad):
         super().step(dt)
         self.steps += 1
         # highway-env marks vehicles that will overlap after one more step; they count as crashed now
-        self.crashed = [k for k, vehicle in enumerate(self.vehicles) if vehicle.crashed or vehicle.impact is not None]
+        self.crashed = self.struck if self.fast else self.find_struck(range(len(self.vehicles)))
         self.collided += len(self.crashed)
         if self.crashed:
             self.crash_pose = self.pose()

@@ -89,5 +89,5 @@ def connect_poses(start: tuple[float, float, float], end: tuple[float, float, fl
 
 def true_pairs(table: NDArray[np.bool_]) -> tuple[Ints, Ints]:
     """Return rows and columns of what is true in a table, in its order: `np.nonzero`, five times faster."""
-    rows, columns = np.divmod(np.flatnonzero(table), table.shape[1])
+    rows, columns = np.divmod(table.ravel().nonzero()[0], table.shape[1])
     return rows, columns

@@ -77,6 +77,7 @@ class Recorder:
         self.step = 0  # the next one, or the one between `before` and `after`
         self.seen: list[dict[str, Any]] = []  # of each step, as it was before rounding
         self.plans: dict[int, tuple[list[int], list[float]]] = {}
+        self.agents = np.empty(0, np.int64)  # numbers of the vehicles in the last step recorded
         self.collided = road.collided
 
     def watch(self) -> None:
@@ -93,10 +94,11 @@ class Recorder:
         decisions = self.road.decide()
         x, y, heading, speed = self.road.decided_pose
         self.standing = np.where(speed < STANDING, self.standing + DT, 0)
-        fleet, agents = self.road.fleet, np.array(self.road.agents)
-        for slot, agent in enumerate(self.road.agents):
-            self.plans.setdefault(agent, (fleet.routes[slot], fleet.starts[slot]))
-        self.seen.append({"agent": agents, "speed": speed, "standing": self.standing, "route_s": decisions.route_s})
+        if self.agents.tolist() != self.road.agents:
+            self._meet()
+        self.seen.append(
+            {"agent": self.agents, "speed": speed, "standing": self.standing, "route_s": decisions.route_s}
+        )
         self._write("present", values=True)
         self._write("x", x)
         self._write("y", -y)
@@ -114,15 +116,20 @@ class Recorder:
         self._write("acceleration", self.road.decisions.acceleration)
         self.step += 1
 
-    def _write(self, name: str, values: Any) -> None:
-        agents = self.seen[-1]["agent"]
+    def _meet(self) -> None:
+        """Note the plans of new vehicles, and make room for them."""
+        self.agents, fleet = np.array(self.road.agents), self.road.fleet
+        for slot, agent in enumerate(self.road.agents):
+            self.plans.setdefault(agent, (fleet.routes[slot], fleet.starts[slot]))
         steps, columns = self.arrays["x"].shape
-        if agents.max() >= columns:
-            wider = empty_states(steps, 2 * int(agents.max()))
+        if self.agents.max() >= columns:
+            wider = empty_states(steps, 2 * int(self.agents.max()))
             for key, old in self.arrays.items():
                 wider[key][:, :columns] = old
             self.arrays = wider
-        self.arrays[name][self.step, agents] = values
+
+    def _write(self, name: str, values: Any) -> None:
+        self.arrays[name][self.step, self.agents] = values
 
     def facts(self, cycle: float) -> dict[str, Any]:
         """Return collisions, the share of vehicle-time standing longer than `cycle` [s], and the mean speed [m/s]."""

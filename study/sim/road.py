@@ -7,6 +7,7 @@ formula, operation by operation. So a drive is bit-equal with and without `fast`
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -167,6 +168,10 @@ class TownVehicle(Vehicle):
 class TownRoad(Road):
     """highway-env's road, whose searches over all pairs of vehicles are done with arrays."""
 
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.struck: list[int] = []  # vehicles that have crashed, or will in the next step
+
     @property
     def fast(self) -> bool:
         """Return whether the spatial look-ups are used."""
@@ -202,8 +207,14 @@ class TownRoad(Road):
             super().step(dt)
             return
         self.moved = self._move(dt)
-        for i, j in zip(*self._touching(self.moved, dt), strict=True):
+        touching = self._touching(self.moved, dt)
+        for i, j in zip(*touching, strict=True):
             self.vehicles[i].handle_collisions(self.vehicles[j], dt)
+        self.struck = self.find_struck(np.unique(np.concatenate([self.struck, *touching])).astype(np.int64).tolist())
+
+    def find_struck(self, slots: Iterable[int]) -> list[int]:
+        """Return which of these vehicles have crashed, or will overlap another after one more step."""
+        return [k for k in slots if self.vehicles[k].crashed or self.vehicles[k].impact is not None]
 
     def controls(self) -> tuple[Pose, Floats, Floats]:
         """Return the pose of all vehicles, and the acceleration [m/s2] and the wheel angle [rad] that act on them."""
@@ -216,11 +227,7 @@ class TownRoad(Road):
     def _move(self, dt: float) -> Pose:
         """Do `Vehicle.step` for all vehicles, and return their new pose."""
         (x, y, heading, speed), push, steering = self.controls()
-        odd = [
-            k
-            for k, vehicle in enumerate(self.vehicles)
-            if vehicle.crashed or vehicle.impact is not None or abs(vehicle.speed) > vehicle.MAX_SPEED
-        ]
+        odd = {*self.find_struck(self.struck), *(np.abs(speed) > TownVehicle.MAX_SPEED).nonzero()[0].tolist()}
         for k in odd:
             self.vehicles[k].act({"acceleration": float(push[k]), "steering": float(steering[k])})
             self.vehicles[k].step(dt)
