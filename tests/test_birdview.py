@@ -134,6 +134,34 @@ def test_past_poses_fade_linearly_to_black(who, colour):
     np.testing.assert_allclose(light, expected, atol=1.5)
 
 
+def on_foot(episode, kind, size=0.5):
+    agents = (episode.agents[0], *(Agent(item.id, size, size, kind=kind) for item in episode.agents[1:]))
+    return dataclasses.replace(episode, agents=agents)
+
+
+@pytest.mark.parametrize(("kind", "shade"), [("cyclist", (128, 255, 0)), ("pedestrian", (255, 128, 0))])
+def test_cyclists_and_pedestrians_have_shades_of_their_own(kind, shade):
+    episode = on_foot(drive([(0, 0, 0.0, 0.0), (10, 5, 0.0, 0.0)]), kind, size=2.0)
+    image, pred, _ = bird_view(episode, NOW, 0, SETTINGS)
+    assert tuple(image[pixel(10, 5)]) == shade
+    assert pred[pixel(10, 5)]
+    assert tuple(image[pixel(0, 0)]) == (0, 0, 255)
+    assert bird_view(dataclasses.replace(episode, agents=episode.agents[::-1]), NOW, 1, SETTINGS)[0].any()
+
+
+def test_a_pedestrian_of_half_a_metre_is_seen_and_predicted_wherever_it_stands():
+    """It is painted a metre long and wide: a square of 1.6 pixels covers more than half of some pixel."""
+    rng = np.random.default_rng(0)
+    tracks = [(0, 0, 0.0, 0.0)]
+    for ahead, left, heading in rng.uniform((4, -15, -3), (20, 15, 3), (40, 3)):
+        episode = on_foot(drive([*tracks, (ahead, left, heading, 0.0)]), "pedestrian")
+        image, pred, _ = bird_view(episode, NOW, 0, SETTINGS)
+        assert pred.sum() in (1, 2, 3, 4)
+        assert image[..., 0].max() > 127
+        without, _, _ = bird_view(drive(tracks), NOW, 0, SETTINGS)
+        assert np.abs(image.astype(int) - without).sum() / (255 * 1.5) == pytest.approx(1.6**2, rel=0.25)
+
+
 def test_the_present_pose_lies_on_top_of_older_ones():
     """A car that backs up covers where it was a moment ago with its full colour."""
     image, _, _ = bird_view(drive([(0, 0, 0.0, 0.0), (10, 0, 0.0, -0.2)]), NOW, 0, SETTINGS)

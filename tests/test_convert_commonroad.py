@@ -15,7 +15,7 @@ STEPS = 80
 
 @pytest.fixture
 def scenario(tmp_path):
-    """Return a file of commonroad-io: two lanes, then one that bends left, a light, a car, a lorry and a parked car."""
+    """Return a file of commonroad-io: lanes, a light, a car, a lorry, a walker, a bicycle and a parked car."""
     from commonroad.common.common_lanelet import LaneletType, LineMarking
     from commonroad.common.writer.file_writer_interface import OverwriteExistingFile
     from commonroad.common.writer.file_writer_xml import XMLFileWriter
@@ -68,6 +68,7 @@ def scenario(tmp_path):
             vehicle(21, ObstacleType.CAR, 4.5, 10.0, 0.0, 8.0),
             vehicle(22, ObstacleType.TRUCK, 9.0, 5.0, 3.0, 5.0),
             vehicle(23, ObstacleType.PEDESTRIAN, 0.5, 5.0, -3.0, 1.0),
+            vehicle(25, ObstacleType.BICYCLE, 1.8, 25.0, 0.0, 4.0),
             StaticObstacle(
                 24,
                 ObstacleType.PARKED_VEHICLE,
@@ -87,11 +88,16 @@ def test_a_scenario_is_an_episode_without_findings(scenario, tmp_path):
     assert [str(finding) for finding in check_drives(tmp_path / "out")] == []
     drive = read_episode(tmp_path / "out" / scenario.stem)
     assert (drive.rate_hz, drive.steps, drive.labels) == (10.0, STEPS, "none")
-    assert [(item.id, item.length, item.ego) for item in drive.agents] == [
-        *((21, 4.5, True), (22, 9.0, False), (24, 4.0, False))
+    assert [(item.id, item.length, item.ego, item.kind) for item in drive.agents] == [
+        (21, 4.5, True, "vehicle"),
+        (22, 9.0, False, "vehicle"),
+        (23, 0.5, False, "pedestrian"),
+        (25, 1.8, False, "cyclist"),
+        (24, 4.0, False, "vehicle"),
     ]
+    assert [len(route) > 0 for route in drive.routes] == [True, True, False, True, True]
     assert drive.x[:, 0] == pytest.approx(10 + 0.8 * np.arange(STEPS), abs=1e-3)
-    assert drive.heading[0] == pytest.approx([0, 0, 0.1], abs=1e-3)
+    assert drive.heading[0] == pytest.approx([0, 0, 0, 0, 0.1], abs=1e-3)
 
 
 def test_lanelets_and_lights_keep_their_meaning(scenario, tmp_path):

@@ -40,18 +40,21 @@ def highd(tmp_path):
 
 @pytest.fixture
 def ind(tmp_path):
-    """Return a recording of a car that drives north, one that reverses, and a pedestrian."""
+    """Return a recording of a car that drives north, one that reverses, a pedestrian who walks aside, and a bicycle."""
     column = {"frame": np.arange(FRAMES), "trackLifetime": np.arange(FRAMES)}
     north = {"trackId": 0, "xCenter": 50.0, "yCenter": -60 + 10 * SECONDS, "heading": 90.0, "xVelocity": 0.0}
     back = {"trackId": 1, "xCenter": 80 - 2 * SECONDS, "yCenter": -50.0, "heading": 0.0, "xVelocity": -2.0}
-    walk = {"trackId": 2, "xCenter": 60.0, "yCenter": -50.0 + SECONDS, "heading": 90.0, "xVelocity": 0.0}
-    speeds = (10.0, 0.0, 1.0)
+    walk = {"trackId": 2, "xCenter": 60.0, "yCenter": -50.0 + SECONDS, "heading": 0.0, "xVelocity": 0.0}
+    ride = {"trackId": 3, "xCenter": 70.0, "yCenter": -80.0 + 4 * SECONDS, "heading": 90.0, "xVelocity": 0.0}
+    speeds = (10.0, 0.0, 1.0, 4.0)
     tables = [
-        pd.DataFrame(column | row | {"yVelocity": vy}) for row, vy in zip((north, back, walk), speeds, strict=True)
+        pd.DataFrame(column | row | {"yVelocity": vy})
+        for row, vy in zip((north, back, walk, ride), speeds, strict=True)
     ]
     pd.concat(tables).to_csv(tmp_path / "07_tracks.csv", index=False)
-    sizes = {"trackId": [0, 1, 2], "width": [1.9, 2.0, 0.0], "length": [4.4, 5.5, 0.0]}
-    pd.DataFrame(sizes | {"class": ["car", "van", "pedestrian"]}).to_csv(tmp_path / "07_tracksMeta.csv", index=False)
+    sizes = {"trackId": [0, 1, 2, 3], "width": [1.9, 2.0, 0.0, 0.0], "length": [4.4, 5.5, 0.0, 0.0]}
+    names = ["car", "van", "pedestrian", "bicycle"]
+    pd.DataFrame(sizes | {"class": names}).to_csv(tmp_path / "07_tracksMeta.csv", index=False)
     recording = {"recordingId": [7], "frameRate": [25.0], "speedLimit": [13.9]}
     recording |= {"xUtmOrigin": [ORIGIN[0]], "yUtmOrigin": [ORIGIN[1]]}
     pd.DataFrame(recording).to_csv(tmp_path / "07_recordingMeta.csv", index=False)
@@ -90,14 +93,16 @@ def test_ind_is_an_episode_without_findings(ind, tmp_path):
     assert main(["convert", "highd", str(ind.parent), "--out", str(tmp_path / "out")]) == 0
     assert [str(finding) for finding in check_drives(tmp_path / "out")] == []
     drive = read_episode(tmp_path / "out/07")
-    assert [(item.id, item.length, item.width, item.ego) for item in drive.agents] == [
-        (0, 4.4, 1.9, True),
-        (1, 5.5, 2.0, True),
+    assert [(item.length, item.width, item.ego, item.kind) for item in drive.agents] == [
+        (4.4, 1.9, True, "vehicle"),
+        (5.5, 2.0, True, "vehicle"),
+        (0.5, 0.5, False, "pedestrian"),  # the table has no sizes of these
+        (1.8, 0.65, False, "cyclist"),
     ]
     assert drive.lanes == ()
     assert drive.y[:, 0] == pytest.approx(-60 + np.arange(60), abs=1e-3)
-    assert drive.heading[0] == pytest.approx([np.pi / 2, 0])
-    assert drive.speed[0] == pytest.approx([10.0, -2.0])
+    assert drive.heading[0] == pytest.approx([np.pi / 2, 0, 0, np.pi / 2])
+    assert drive.speed[0] == pytest.approx([10.0, -2.0, 1.0, 4.0])
 
 
 def degrees(x, y):

@@ -104,6 +104,24 @@ def test_types_and_routes_come_from_the_demand(tmp_path):
     assert drive.routes[1][-1].tolist() == [105.0, pytest.approx(1.6)], "without a plan, a way ends where it was seen"
 
 
+def test_persons_on_foot_are_pedestrians(tmp_path):
+    """One walks over the road, with the id of a vehicle; another sits in it, and is left out."""
+    fcd = write_fcd(tmp_path)
+    rows = fcd.read_text().split("</timestep>")
+    for step in range(len(rows) - 1):
+        place = f'x="150" y="{-5 + 0.12 * step:.2f}" angle="0" speed="1.2" type="DEFAULT_PEDTYPE"'
+        inside = place.replace("/>", "") + ' vehicle="a"'
+        rows[step] += f'<person id="a" {place}/><person id="c" {inside}/>'
+    fcd.write_text("</timestep>".join(rows))
+    convert([write_net(tmp_path)], tmp_path / "out", 60.0, fcd=[fcd])
+    assert [str(finding) for finding in check_drives(tmp_path / "out")] == []
+    drive = read_episode(tmp_path / "out/fcd")
+    assert [(agent.kind, agent.ego) for agent in drive.agents] == [*[("vehicle", True)] * 2, ("pedestrian", False)]
+    assert drive.y[:, 2] == pytest.approx(-5.1 + 0.12 * np.arange(drive.steps), abs=0.01)
+    assert drive.heading[:, 2] == pytest.approx(np.pi / 2)
+    assert len(drive.routes[2]) == 0
+
+
 def test_recorded_states_of_lights_come_first(tmp_path):
     states = tmp_path / "tls.xml"
     states.write_text(
@@ -214,6 +232,7 @@ def scenario(tmp_path_factory):
         subprocess.run([programs / name, *words], cwd=folder, check=True, capture_output=True)
 
     lights = ("--tls.guess", "true", "--tls.default-type", "static", "--no-turnarounds", "true")
+    walks = ("--sidewalks.guess", "--crossings.guess")
     run(
         "netgenerate",
         "--grid",
@@ -224,6 +243,7 @@ def scenario(tmp_path_factory):
         "-L",
         "2",
         *lights,
+        *walks,
         "-o",
         "g.net.xml",
     )
@@ -237,7 +257,12 @@ def scenario(tmp_path_factory):
         for number, (start, end) in enumerate(ways)
         for kind, period in (("car", 4), ("lorry", 30), ("bike", 40))
     ]
-    (folder / "g.rou.xml").write_text(f"<routes>{kinds}{''.join(flows)}</routes>")
+    walkers = [
+        f'<personFlow id="walk{number}" begin="0" end="90" period="9"><walk from="{start}" to="{end}"/></personFlow>'
+        for number, (start, end) in enumerate(ways)
+    ]
+    rider = '<person id="rider" depart="50"><ride from="left0A0" to="B0right0" lines="car0.3"/></person>'
+    (folder / "g.rou.xml").write_text(f"<routes>{kinds}{''.join(flows + walkers)}{rider}</routes>")
     files = '<net-file value="g.net.xml"/><route-files value="g.rou.xml"/>'
     (folder / "g.sumocfg").write_text(f"<configuration><input>{files}</input></configuration>")
     events = "".join(
@@ -253,7 +278,7 @@ def test_static_programs_tell_what_sumo_says(scenario):
     fcd, demand = scenario / "fcd.xml", [scenario / "g.rou.xml"]
     computed, recorded = (read_fcd(fcd, net, demand, path).states for path in (None, scenario / "tls.xml"))
     for tl, states in recorded.items():
-        assert len(set(states)) == 4
+        assert len(set(states)) == 6, "with and without the crossings' green"
         assert np.mean([one == other for one, other in zip(computed[tl], states, strict=True)]) > 0.99
 
 
@@ -280,9 +305,21 @@ def test_vehicles_of_sumo_stop_at_red_lights_on_their_lanes(runs):
     lengths = np.array([item.length for item in drive.agents])
     gap = drive.light_distance[there] - lengths[agent] / 2  # of the front bumper
     assert np.quantile(gap, [0.1, 0.9]) == pytest.approx([1.0, 1.0], abs=0.5)  # SUMO's own distance from a line
-    egos = {item.length: item.ego for item in drive.agents}
-    assert egos == {5.0: True, 1.6: False, 7.1: False} | {5.0: True}
-    assert np.isfinite(drive.route_s[drive.present]).mean() > 0.99
+    assert {(item.length, item.ego, item.kind) for item in drive.agents} == {
+        *((5.0, True, "vehicle"), (7.1, False, "vehicle")),
+        *((1.6, False, "cyclist"), (0.215, False, "pedestrian")),
+    }
+    drives = drive.present & np.array([item.kind != "pedestrian" for item in drive.agents])
+    assert np.isfinite(drive.route_s[drives]).mean() > 0.99
+
+
+def test_persons_of_sumo_walk_and_wait(runs):
+    for name in ("run/g-000", "fcd/fcd"):
+        drive = read_episode(runs / name)
+        walks = drive.present & np.array([item.kind == "pedestrian" for item in drive.agents])
+        assert walks.any(axis=0).sum() > 5
+        assert drive.speed[walks].max() < 3
+        assert 0.5 < np.median(drive.speed[walks]) < 2
 
 
 def test_another_seed_is_another_drive_and_the_same_is_the_same(runs, scenario, tmp_path):

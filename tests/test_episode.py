@@ -1,13 +1,15 @@
 """An Episode survives writing and reading; what is not one is refused with file, row and field."""
 
 import dataclasses
+import json
 
 import numpy as np
 import pandas as pd
 import pytest
 
 from study.episode.files import FILES, read_episode, write_episode
-from study.episode.schema import Episode
+from study.episode.head import episode_digest
+from study.episode.schema import Agent, Episode
 from study.errors import BadInputError
 from tests.support.drives import crossing_drive
 from tests.support.spoil import spoil
@@ -127,10 +129,50 @@ def test_wrong_states_are_refused_with_row_and_field(folder, change, words):
     assert all(word in str(caught.value) for word in ["states.parquet", *words]), caught.value
 
 
+def test_a_drive_of_vehicles_is_written_as_version_1(folder):
+    head = json.loads((folder / "episode.json").read_text())
+    assert head["schema_version"] == 1
+    assert {tuple(agent) for agent in head["agents"]} == {("id", "length", "width", "ego")}
+
+
+def with_classes(drive, *kinds):
+    agents = tuple(Agent(agent.id, 0.5, 0.5, kind=kind) for agent, kind in zip(drive.agents, kinds, strict=False))
+    return dataclasses.replace(drive, agents=(*agents, *drive.agents[len(agents) :]))
+
+
+def test_classes_are_kept_and_count_in_the_digest(drive, tmp_path):
+    mixed = with_classes(drive, "pedestrian", "cyclist", "vehicle")
+    digest = write_episode(mixed, tmp_path / "mixed")
+    assert json.loads((tmp_path / "mixed/episode.json").read_text())["schema_version"] == 1.1
+    read = read_episode(tmp_path / "mixed")
+    assert read.agents == mixed.agents
+    assert [agent.ego for agent in read.agents[:3]] == [False, False, True]
+    assert read.digest == digest == episode_digest(tmp_path / "mixed")
+    assert digest != write_episode(drive, tmp_path / "plain"), "or frames of the one would pass for those of the other"
+    with pytest.raises(BadInputError, match="class of agent 100 is 'horse'; choose from vehicle, cyclist"):
+        write_episode(with_classes(drive, "horse"), tmp_path / "horse")
+
+
+def of_version(version, change):
+    """Return a change of the head's version and of its first agent."""
+    return lambda head: (head.update(schema_version=version), head["agents"][0].update(change))
+
+
+def test_a_pedestrian_is_no_ego_unless_the_file_says_so(folder):
+    spoil(folder, "episode.json", of_version(1.1, {"class": "pedestrian"}))
+    spoil(folder, "episode.json", lambda head: [agent.pop("ego") for agent in head["agents"]])
+    assert [agent.ego for agent in read_episode(folder).agents] == [False, *[True] * 5]
+    spoil(folder, "episode.json", of_version(1.1, {"ego": True}))
+    assert read_episode(folder).agents[0].ego
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         (lambda head: head.update(schema_version=2), ["schema_version", "2"]),
+        (lambda head: head["agents"][1].update({"class": "cyclist"}), ["agents[1]", "class", "schema_version 1.1"]),
+        (of_version(1.1, {"class": "horse"}), ["agents[0]", "'horse'", "one of vehicle, cyclist, pedestrian"]),
+        (of_version(1.1, {"class": 3}), ["agents[0]", "class", "one of vehicle"]),
         (lambda head: head.update(rate_hz=0), ["rate_hz"]),
         (lambda head: head.update(labels="guessed"), ["labels", "guessed"]),
         (lambda head: head.pop("agents"), ["agents"]),

@@ -180,6 +180,21 @@ def test_motion_that_no_vehicle_makes_is_refused_agent_by_agent(log, fault):
     assert count in (None, 1) or f"[{count} rows of agent" in message
 
 
+def test_pedestrians_may_step_aside_turn_on_the_spot_and_walk_hand_in_hand(log):
+    """What is refused of a vehicle, see MOTION."""
+    for number in (1, 3):
+        spoil(
+            log / "drive-001",
+            "episode.json",
+            lambda head, at=number: head["agents"][at].update({"class": "pedestrian"}),
+        )
+    spoil(log / "drive-001", "episode.json", lambda head: head.update(schema_version=1.1))
+    for change in (list_twice, MOTION["backwards"][0], MOTION["one heading"][0]):
+        spoil(log / "drive-001", STATES, change)
+    spoil(log / "drive-001", STATES, lambda table: table.assign(steering=table.steering.where(table.agent != 101)))
+    assert [str(finding) for finding in check_drives(log)] == []
+
+
 def test_steering_to_the_other_side_is_refused(log):
     message = refusal(log, STATES, lambda table: table.assign(steering=-table.steering))
     assert "field 'steering'" in message

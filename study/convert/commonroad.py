@@ -15,12 +15,13 @@ from study.convert.drives import as_recording, write_drives
 from study.convert.routes import LaneMap, find_routes
 from study.convert.xml import number, read_xml
 from study.episode.recording import Recording
-from study.episode.schema import GREEN, RED, YELLOW, Agent, Lane, Light
+from study.episode.schema import CYCLIST, GREEN, PEDESTRIAN, RED, VEHICLE, YELLOW, Agent, Lane, Light
 from study.errors import BadInputError
 
 VERSION = "2020a"
 EGO = {"car", "taxi", "priorityVehicle"}
-VEHICLES = EGO | {"truck", "bus", "bicycle", "motorcycle", "parkedVehicle", "unknown"}
+CLASSES = dict.fromkeys(EGO | {"truck", "bus", "motorcycle", "parkedVehicle", "unknown"}, VEHICLE)
+CLASSES |= {"bicycle": CYCLIST, "pedestrian": PEDESTRIAN}
 STATES = {"green": GREEN, "inactive": GREEN, "yellow": YELLOW, "redYellow": RED, "red": RED}
 WALKS = {"sidewalk", "crosswalk"}  # types of lanelets without vehicles
 
@@ -63,7 +64,7 @@ def _recording(path: Path, scenario: Any, rate: float) -> Recording:
     tracks = {key: states for key, _, states in _tracks(path, scenario)}
     agents = [agent for _, agent, _ in _tracks(path, scenario)]
     if not tracks:
-        raise BadInputError(f"{path}: field 'dynamicObstacle': there is no vehicle")
+        raise BadInputError(f"{path}: field 'dynamicObstacle': there is no vehicle, cyclist or pedestrian")
     steps = max(states[-1][0] for states in tracks.values()) + 1
     agents, columns = _columns(agents, tracks, scenario, path, steps)
     lanelets = [
@@ -73,7 +74,7 @@ def _recording(path: Path, scenario: Any, rate: float) -> Recording:
     numbers = {lanelet.lanelet_id: key for key, lanelet in enumerate(lanelets)}
     lights, states, governing = _lights(lanelets, scenario, steps)
     onward = [[numbers[key] for key in lanelet.successor if key in numbers] for lanelet in lanelets]
-    routes = find_routes(columns, len(agents), rate, LaneMap([lane.centre for lane in lanes], onward), governing)
+    routes = find_routes(columns, agents, rate, LaneMap([lane.centre for lane in lanes], onward), governing)
     source = {"writer": "study convert commonroad", "file": path.name, "scenario": str(scenario.scenario_id)}
     return as_recording(path.name.removesuffix(".xml"), source, rate, agents, columns, lanes, lights, states, routes)
 
@@ -82,20 +83,20 @@ def _recording(path: Path, scenario: Any, rate: float) -> Recording:
 
 
 def _tracks(path: Path, scenario: Any) -> Iterator[tuple[int, Agent, list[State]]]:
-    """Yield id, agent and states of each dynamic obstacle that is a vehicle."""
+    """Yield id, agent and states of each dynamic obstacle of a known class."""
     for obstacle in sorted(scenario.dynamic_obstacles, key=lambda obstacle: obstacle.obstacle_id):
         kind = obstacle.obstacle_type.value
-        if kind not in VEHICLES:
+        if kind not in CLASSES:
             continue
         key = obstacle.obstacle_id
         trajectory = getattr(obstacle.prediction, "trajectory", None)
         if obstacle.prediction is not None and trajectory is None:
             raise BadInputError(f"{path}: dynamicObstacle {key}, field 'occupancySet': a 'trajectory' is needed")
         states = [obstacle.initial_state, *(trajectory.state_list if trajectory else ())]
-        yield key, _agent(path, obstacle, kind in EGO), _states(path, obstacle, states)
+        yield key, _agent(path, obstacle, kind in EGO, CLASSES[kind]), _states(path, obstacle, states)
 
 
-def _agent(path: Path, obstacle: Any, ego: bool) -> Agent:  # noqa: FBT001
+def _agent(path: Path, obstacle: Any, ego: bool, kind: str) -> Agent:  # noqa: FBT001
     shape = obstacle.obstacle_shape
     length, width = getattr(shape, "length", None), getattr(shape, "width", None)
     if length is None or width is None:
@@ -105,7 +106,7 @@ def _agent(path: Path, obstacle: Any, ego: bool) -> Agent:  # noqa: FBT001
                 f"{path}: dynamicObstacle {obstacle.obstacle_id}, field 'shape': a rectangle or circle is needed"
             )
         length = width = 2 * radius
-    return Agent(int(obstacle.obstacle_id), float(length), float(width), ego)
+    return Agent(int(obstacle.obstacle_id), float(length), float(width), ego, kind)
 
 
 def _states(path: Path, obstacle: Any, states: Sequence[Any]) -> list[State]:
@@ -133,9 +134,9 @@ def _columns(
     tracks = dict(tracks)
     agents = list(agents)
     for obstacle in scenario.static_obstacles:
-        if obstacle.obstacle_type.value in VEHICLES:
+        if (kind := obstacle.obstacle_type.value) in CLASSES:
             state = obstacle.initial_state
-            agents.append(_agent(path, obstacle, ego=False))
+            agents.append(_agent(path, obstacle, ego=False, kind=CLASSES[kind]))
             parked = (*state.position[:2], state.orientation, 0.0)
             tracks[obstacle.obstacle_id] = [(step, *parked) for step in range(steps)]
     index = np.repeat(np.arange(len(agents)), [len(tracks[agent.id]) for agent in agents])

@@ -15,14 +15,15 @@ from study.convert.drives import as_recording, write_drives
 from study.convert.lanelet2 import onward, read_lanes
 from study.convert.routes import LaneMap, find_routes
 from study.episode.recording import Recording
-from study.episode.schema import Agent, Lane
+from study.episode.schema import CYCLIST, PEDESTRIAN, VEHICLE, Agent, Lane
 from study.errors import BadInputError
 
 HIGHD = ("frame", "id", "x", "y", "width", "height", "xVelocity", "yVelocity")
 OTHERS = ("frame", "trackId", "xCenter", "yCenter", "heading", "xVelocity", "yVelocity")
 SIZES = ("trackId", "width", "length", "class")
 EGO = {"car", "van"}
-WALKING = {"pedestrian", "animal"}
+CLASSES = {"bicycle": CYCLIST, "pedestrian": PEDESTRIAN}  # the others are vehicles
+UNSIZED = {"bicycle": (1.8, 0.65), "pedestrian": (0.5, 0.5)}  # length and width where the table has 0 [m]
 SLOW = 1.0  # below it a velocity does not show where a vehicle heads [m/s]
 
 Rows = dict[str, NDArray[Any]]
@@ -71,7 +72,7 @@ def _recording(path: Path, lane_map: Path | None) -> Recording:
         following = onward(lanes)
     routes = None
     if lanes:
-        routes = find_routes(rows, len(agents), rate, LaneMap([lane.centre for lane in lanes], following), {})
+        routes = find_routes(rows, agents, rate, LaneMap([lane.centre for lane in lanes], following), {})
     source = {"writer": "study convert highd", "file": path.name}
     return as_recording(path.name.removesuffix("_tracks.csv"), source, rate, agents, rows, lanes, routes=routes)
 
@@ -146,7 +147,7 @@ def _highd(path: Path) -> tuple[list[Agent], Rows]:
 
 
 def _others(path: Path) -> tuple[list[Agent], Rows]:
-    """Return vehicles and rows of inD, rounD and exiD: centres, headings in degrees anticlockwise from x."""
+    """Return agents and rows of inD, rounD and exiD: centres, headings in degrees anticlockwise from x."""
     meta_path = path.with_name(path.name.replace("_tracks.csv", "_tracksMeta.csv"))
     kinds = _read(meta_path, SIZES)
     meta = _columns(kinds, SIZES[:3], meta_path)
@@ -154,15 +155,18 @@ def _others(path: Path) -> tuple[list[Agent], Rows]:
     ids, agent = np.unique(c["trackId"], return_inverse=True)
     at = _find(meta["trackId"], ids, meta_path, path)
     names = kinds["class"].astype(str).str.lower().to_numpy()[at]
-    kept = ~np.isin(names, list(WALKING)) & (meta["length"][at] > 0) & (meta["width"][at] > 0)
+    sizes = np.stack([meta["length"], meta["width"]], axis=1)[at]
+    for name, size in UNSIZED.items():
+        sizes[(names == name) & (sizes <= 0).any(axis=1)] = size
+    kept = (names != "animal") & (sizes > 0).all(axis=1)
     agents = [
-        Agent(int(key), float(meta["length"][place]), float(meta["width"][place]), name in EGO)
-        for key, place, name, keep in zip(ids, at, names, kept, strict=True)
+        Agent(int(key), length, width, name in EGO, CLASSES.get(name, VEHICLE))
+        for key, (length, width), name, keep in zip(ids, sizes.tolist(), names, kept, strict=True)
         if keep
     ]
     heading = np.radians(c["heading"])
     forward = c["xVelocity"] * np.cos(heading) + c["yVelocity"] * np.sin(heading)
-    speed = np.hypot(c["xVelocity"], c["yVelocity"]) * np.where(forward < 0, -1, 1)
+    speed = np.hypot(c["xVelocity"], c["yVelocity"]) * np.where((forward < 0) & (names != "pedestrian")[agent], -1, 1)
     heading = np.mod(heading + np.pi, 2 * np.pi) - np.pi
     rows: Rows = {"x": c["xCenter"], "y": c["yCenter"], "heading": heading, "speed": speed}
     rows |= {"step": _steps(c["frame"]), "agent": (kept.cumsum() - 1)[agent]}

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from study.episode.adapt import progress_along
 from study.episode.rows import Rows
+from study.episode.schema import PEDESTRIAN, Agent
 
 CHANGE = 20.0  # a change of lane on a route is a straight line of about this length [m]
 JOINED = 0.5  # ends of lines nearer than this are one point [m]
@@ -137,21 +138,22 @@ def _dense(line: Points) -> Points:
 
 
 def find_routes(
-    rows: Rows, agents: int, rate: float, lanes: LaneMap, lights: Mapping[int, Sequence[int]]
+    rows: Rows, agents: Sequence[Agent], rate: float, lanes: LaneMap, lights: Mapping[int, Sequence[int]]
 ) -> list[Points]:
-    """Add progress and lights to rows, and return the way of each vehicle over the lanes that it took.
+    """Add progress and lights to rows, and return each agent's way over the lanes that it took; pedestrians have none.
 
     `lights` are the lights at the end of lanes; of several, the first governs.
     """
     routes: list[Points] = []
     stops: list[list[tuple[float, int]]] = []
     order = np.lexsort((rows["step"], rows["agent"]))
-    edges = np.searchsorted(rows["agent"][order], np.arange(agents + 1))
-    for agent in range(agents):
-        at = order[edges[agent] : edges[agent + 1]][:: max(1, round(PICKED * rate))]
+    edges = np.searchsorted(rows["agent"][order], np.arange(len(agents) + 1))
+    for number, agent in enumerate(agents):
+        at = order[edges[number] : edges[number + 1]][:: max(1, round(PICKED * rate))]
+        at = at[: 0 if agent.kind == PEDESTRIAN else None]
         visits = lanes.visits(np.stack([rows["x"][at], rows["y"][at]], axis=1), rows["heading"][at])
         route, ends = chain([lanes.centres[lane] for lane in visits])
         routes.append(route)
         stops.append([(end, lights[lane][0]) for lane, end in zip(visits, ends, strict=True) if lights.get(lane)])
-    add_progress(rows, agents, routes, stops)
+    add_progress(rows, len(agents), routes, stops)
     return routes

@@ -14,10 +14,11 @@ from study.convert.routes import add_progress, chain
 from study.convert.sumo_net import Net, read_net
 from study.convert.sumo_trace import Trace, net_of, read_fcd, run_scenario
 from study.episode.recording import Recording
-from study.episode.schema import Agent
+from study.episode.schema import CYCLIST, PEDESTRIAN, VEHICLE, Agent
 from study.errors import BadInputError
 
 EGO = {"passenger", "private", "taxi", "evehicle", "hov", "vip", "custom1", "custom2"}  # vehicle classes
+CLASSES = {"bicycle": CYCLIST, "pedestrian": PEDESTRIAN}  # the others are vehicles
 BESIDE = 10.0  # a vehicle farther from its lane's box is not of this net [m]
 SIDEWAYS = 1.0  # a vehicle that moves so much to the side in a step has changed lane at once [m]
 CHANGE = 15.0  # before and after such a change, over which it is spread [m]
@@ -66,7 +67,10 @@ def _runs(scenarios: Sequence[Path], lights: bool, drives: int, warm_up: float, 
 
 def _recording(net: Net, trace: Trace, details: dict[str, int]) -> Recording:
     _check_net(net, trace)
-    agents = [Agent(key, length, width, group in EGO) for key, (length, width, group) in enumerate(trace.kinds)]
+    agents = [
+        Agent(key, length, width, group in EGO, CLASSES.get(group, VEHICLE))
+        for key, (length, width, group) in enumerate(trace.kinds)
+    ]
     front, heading = trace.values[:, :2].copy(), np.pi / 2 - np.radians(trace.values[:, 2])
     centre, speed, lanes = front.copy(), trace.values[:, 3].copy(), np.array(trace.lane)
     ways: list[Floats] = []
@@ -75,11 +79,14 @@ def _recording(net: Net, trace: Trace, details: dict[str, int]) -> Recording:
     edges = np.searchsorted(trace.vehicle[order], np.arange(len(agents) + 1))
     for agent, route in zip(agents, trace.routes, strict=True):
         at = order[edges[agent.id] : edges[agent.id + 1]]
-        front[at] = _smooth(trace.step[at], lanes[at], front[at], heading[at], speed[at], trace.rate)
-        heading[at] = _headings(trace.step[at], front[at], heading[at], agent.length)
+        walks = agent.kind == PEDESTRIAN
+        if not walks:
+            front[at] = _smooth(trace.step[at], lanes[at], front[at], heading[at], speed[at], trace.rate)
+            heading[at] = _headings(trace.step[at], front[at], heading[at], agent.length)
         centre[at] = front[at] - agent.length / 2 * np.stack([np.cos(heading[at]), np.sin(heading[at])], axis=1)
-        speed[at] *= _share_of_speed(front[at], centre[at])
-        way, lines = _route(net, lanes[at].tolist(), route)
+        if not walks:
+            speed[at] *= _share_of_speed(front[at], centre[at])
+        way, lines = _route(net, [] if walks else lanes[at].tolist(), route)
         ways.append(way)
         stops.append(lines)
     rows = {"step": trace.step, "agent": trace.vehicle, "heading": heading, "speed": speed}
@@ -94,7 +101,8 @@ def _recording(net: Net, trace: Trace, details: dict[str, int]) -> Recording:
 def _check_net(net: Net, trace: Trace) -> None:
     """Raise BadInputError when a vehicle is on a lane that the net has not, or most are not where their lanes are."""
     names = {name: number for number, name in enumerate(net.shapes)}
-    unknown = next((number for number, lane in enumerate(trace.lane) if lane not in names), None)
+    drives = [number for number, lane in enumerate(trace.lane) if lane]  # persons have no lane
+    unknown = next((number for number in drives if trace.lane[number] not in names), None)
     if unknown is not None:
         vehicle, time = trace.names[trace.vehicle[unknown]], trace.times[trace.step[unknown]]
         raise BadInputError(
@@ -102,10 +110,11 @@ def _check_net(net: Net, trace: Trace) -> None:
             f"'{trace.lane[unknown]}' for vehicles; give the net that they drove on"
         )
     boxes = np.array([(line.min(axis=0) - BESIDE, line.max(axis=0) + BESIDE) for line in net.shapes.values()])
-    low, high = boxes[[names[lane] for lane in trace.lane]].transpose(1, 0, 2)
-    beside = ((trace.values[:, :2] < low) | (trace.values[:, :2] > high)).any(axis=1)
-    if beside.mean() > 0.5:
-        first = int(beside.argmax())
+    low, high = boxes[[names[trace.lane[number]] for number in drives]].transpose(1, 0, 2)
+    places = trace.values[drives, :2]
+    beside = ((places < low) | (places > high)).any(axis=1)
+    if drives and beside.mean() > 0.5:
+        first = drives[int(beside.argmax())]
         x, y = trace.values[first, :2]
         raise BadInputError(
             f"{trace.source}: 'vehicle' {trace.names[trace.vehicle[first]]}, fields 'x' and 'y': ({x:g}, {y:g}) is not "

@@ -1,6 +1,7 @@
-"""What SUMO tells of vehicles: read from FCD output, or from a scenario that is run through TraCI.
+"""What SUMO tells of vehicles and persons: read from FCD output, or from a scenario that is run through TraCI.
 
-Positions are of the front bumper's middle, angles are compass degrees: clockwise from north.
+Positions are of the front's middle, angles are compass degrees: clockwise from north. Of persons, the lane is empty,
+and those in a vehicle are left out.
 """
 
 from __future__ import annotations
@@ -38,8 +39,11 @@ SIZES = {  # SUMO's default length and width of each vehicle class [m]
     "motorcycle": (2.2, 0.9),
     "moped": (2.1, 0.8),
     "bicycle": (1.6, 0.65),
+    "pedestrian": (0.215, 0.478),
 }
 DEFAULT_TYPES = {"DEFAULT_VEHTYPE": "passenger", "DEFAULT_BIKETYPE": "bicycle", "DEFAULT_TAXITYPE": "taxi"}
+DEFAULT_TYPES |= {"DEFAULT_PEDTYPE": "pedestrian"}
+PERSON = "person "  # before the ids of persons, which may be those of vehicles
 MISSING = "the extra 'sumo' is not installed: pip install 'study[sumo]' brings SUMO and TraCI"
 
 Kind = tuple[float, float, str]  # length and width [m], vehicle class
@@ -47,7 +51,7 @@ Kind = tuple[float, float, str]  # length and width [m], vehicle class
 
 @dataclass
 class Trace:
-    """Rows of vehicles, one for each vehicle at each step, and the state of each light at each step."""
+    """Rows of vehicles and persons, one for each at each step, and the state of each light at each step."""
 
     source: Path
     rate: float
@@ -105,10 +109,13 @@ def read_fcd(path: Path, net: Net, demand: Sequence[Path], tls_states: Path | No
         for _, element in ET.iterparse(stream):  # noqa: S314 - expat itself refuses entities that grow
             if element.tag != "timestep":
                 continue
-            for row in element.iter("vehicle"):
-                name, known = text(row, "id", path), len(rows.known)
+            for row in element:
+                walks = row.tag == "person"
+                if row.tag not in {"vehicle", "person"} or row.get("vehicle"):  # a person in a vehicle
+                    continue
+                name, known = PERSON * walks + text(row, "id", path), len(rows.known)
                 values = [number(row, column, path) for column in ("x", "y", "angle", "speed")]
-                rows.add(len(times), name, text(row, "lane", path), values)
+                rows.add(len(times), name, "" if walks else text(row, "lane", path), values)
                 if len(rows.known) > known:
                     types.append(text(row, "type", path))
             times.append(number(element, "time", path))
@@ -228,6 +235,7 @@ def run_scenario(scenario: Path, net: Net, seed: int, warm_up: float, seconds: f
             connection.trafficlight.subscribe(tl, (codes.TL_RED_YELLOW_GREEN_STATE,))
         while True:
             _take(connection, new, step, rows, kinds)
+            _take_persons(connection, step, rows, kinds)
             for tl, result in connection.trafficlight.getAllSubscriptionResults().items():
                 states[tl].extend(result.values())
             step += 1
@@ -257,6 +265,23 @@ def _take(connection: Any, new: Sequence[str], step: int, rows: _Rows, kinds: li
         if name not in rows.known:
             kinds.append((vehicle.getLength(name), vehicle.getWidth(name), vehicle.getVehicleClass(name)))
         rows.add(step, name, values[lane], (*values[place], values[angle], values[speed]))
+
+
+def _take_persons(connection: Any, step: int, rows: _Rows, kinds: list[Kind]) -> None:
+    """Add the rows of the persons that are on foot in a step; they have no lane."""
+    person, codes = connection.person, _codes()
+    place, angle, speed, vehicle = codes.VAR_POSITION, codes.VAR_ANGLE, codes.VAR_SPEED, codes.VAR_VEHICLE
+    known = person.getAllSubscriptionResults()
+    for name in sorted(person.getIDList()):
+        if name not in known:
+            person.subscribe(name, (place, angle, speed, vehicle))
+            known[name] = person.getSubscriptionResults(name)
+        values = known[name]
+        if values[vehicle]:
+            continue
+        if PERSON + name not in rows.known:
+            kinds.append((person.getLength(name), person.getWidth(name), "pedestrian"))
+        rows.add(step, PERSON + name, "", (*values[place], values[angle], values[speed]))
 
 
 def _codes() -> Any:

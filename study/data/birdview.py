@@ -1,7 +1,8 @@
 """Bird view: moments of an Episode as images and masks (Sec. III-A).
 
 Layers, in paint order: map (drivable surface, road boundary, lane lines), the planned way ahead (green, or red by the
-light that governs it), other vehicles' past and present poses (yellow), the ego's (blue). Everything is painted with
+light that governs it), other agents' past and present poses (vehicles yellow, cyclists lime, pedestrians
+orange), the ego's (blue). Everything is painted with
 hard edges at `settings.render` pixels a side, as indices into a palette, and area-averaged to 64.
 
 The map does not change during a drive, so it is painted once for each Episode; a frame cuts its window out of that
@@ -22,8 +23,8 @@ from numpy.typing import NDArray
 from study.config.heads import mask_heads
 from study.config.paper import IMAGE
 from study.config.settings import BirdviewSettings
-from study.data.targets import FRACTION_BITS, Floats, Moment, find_target, fixed_point
-from study.episode.schema import GREEN, RATE_HZ, Episode, Lane
+from study.data.targets import FRACTION_BITS, Floats, Moment, find_target, fixed_point, painted_sizes
+from study.episode.schema import CYCLIST, GREEN, PEDESTRIAN, RATE_HZ, VEHICLE, Episode, Lane
 from study.errors import BadInputError
 
 MASK_BYTES = IMAGE * IMAGE // 8
@@ -33,6 +34,13 @@ PLAIN_SURFACE = 80  # grey where all lanes have one limit, and that of 40 km/h
 LIMIT_STEP, LIMIT_SHADES = 5 / 3.6, 20  # [m/s]; limits of 95 km/h and more look alike
 BOUNDARY, LINE = 176, 255  # greys of curbs and of lane lines
 BOUNDARY_WIDTH, LINE_WIDTH, ROUTE_WIDTH = 0.5, 0.3, 2.0  # [m]
+AGENTS = {  # palette of poses, RGB; who they are of: the class, but for the ego
+    VEHICLE: (255, 255, 0),
+    "ego": (0, 0, 255),
+    CYCLIST: (128, 255, 0),
+    PEDESTRIAN: (255, 128, 0),
+}
+LEAST = 1.6  # side of a painted cyclist or pedestrian at least [pixels of the image]: any such square sets a mask
 DASH = 3.0  # [m], length of a dash and of the gap behind it
 ROUTE_POINTS = 2.0  # [m] apart: 0.1 m off on the tightest turn of a car
 
@@ -128,7 +136,8 @@ class Renderer:
 
     def _take(self, episode: Episode) -> None:
         self.episode = episode
-        self._sizes = np.array([(agent.length, agent.width) for agent in episode.agents]).reshape(-1, 2)
+        self._sizes = painted_sizes(episode.agents, LEAST * self.settings.view / IMAGE)
+        self._palette_of = np.array([list(AGENTS).index(agent.kind) for agent in episode.agents], np.int64)
         self._reach = np.hypot(*self._sizes.T).max(initial=0) / 2 + 1  # of a box from its centre, with a metre to spare
         self._routes = [
             (np.concatenate([[0.0], np.hypot(*np.diff(route, axis=0).T).cumsum()]), *route.T.astype(np.float64))
@@ -250,7 +259,7 @@ class Renderer:
         layer = np.where(pose <= history, 0, 2) + is_ego  # others' past, ego's past, pred, plan
         order = np.lexsort((pose, layer, frame))
         order = order[~hidden[order]]
-        colour = _OTHERS + pose + is_ego * (history + 1)
+        colour = _OTHERS + pose + np.where(is_ego, list(AGENTS).index("ego"), self._palette_of[agent]) * (history + 1)
         part = (frame * 3 + np.maximum(layer - 1, 0))[order]
         ends = np.searchsorted(part, np.arange(len(moments) * 3), side="right").reshape(-1, 3)
         return list(fixed[order]), colour[order].tolist(), ends.tolist()
@@ -270,16 +279,16 @@ class Renderer:
 
 def _palette(history: int) -> Image:
     """Return the colours [3, 256] RGB by palette index. Past poses fade to black, linear in their age."""
-    if _OTHERS + 2 * (history + 1) > 256:
-        raise BadInputError(f"birdview.history: at most {(256 - _OTHERS) // 2 - 1} past poses, got {history}")
+    if _OTHERS + len(AGENTS) * (history + 1) > 256:
+        raise BadInputError(f"birdview.history: at most {(256 - _OTHERS) // len(AGENTS) - 1} past poses, got {history}")
     colours = np.zeros((256, 3), np.uint8)
     first, step = SURFACE
     colours[1 : 1 + LIMIT_SHADES] = (first + step * np.arange(LIMIT_SHADES))[:, None]
     colours[[_PLAIN, _BOUNDARY, _LINE]] = np.array([[PLAIN_SURFACE], [BOUNDARY], [LINE]])
     colours[_GREEN], colours[_RED] = (0, 255, 0), (255, 0, 0)
-    light = np.rint(255 * np.arange(1, history + 2) / (history + 1))
-    colours[_OTHERS : _OTHERS + history + 1, :2] = light[:, None]
-    colours[_OTHERS + history + 1 : _OTHERS + 2 * (history + 1), 2] = light
+    light = np.arange(1, history + 2)[:, None] / (history + 1)
+    poses = np.rint(np.concatenate([np.array(colour) * light for colour in AGENTS.values()]))
+    colours[_OTHERS : _OTHERS + len(poses)] = poses
     return np.ascontiguousarray(colours.T)
 
 

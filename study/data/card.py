@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections import Counter
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -23,6 +24,7 @@ from study.config.paper import ACCELERATIONS, IMAGE
 from study.data.frames import Frames, FrameStore
 from study.data.selection import SETS
 from study.episode.head import episode_digest
+from study.episode.schema import VEHICLE
 from study.randomness import rng
 
 FILES = ("card.json", "card.txt", "card.png")
@@ -100,7 +102,8 @@ def source_drives(store: FrameStore, folder: Path) -> list[Path]:
 
 def _drives(paths: Sequence[Path]) -> dict[str, Any]:
     """Return sums over the drives, from their heads and one column of their states."""
-    seconds, vehicle_seconds, metres, vehicles = 0.0, 0.0, 0.0, 0
+    seconds, vehicle_seconds, metres = 0.0, 0.0, 0.0
+    classes: Counter[str] = Counter()
     maps, seeds, writers, labels = set(), set(), set(), set()
     for path in paths:
         head = json.loads((path / "episode.json").read_text(encoding="utf-8"))
@@ -108,7 +111,7 @@ def _drives(paths: Sequence[Path]) -> dict[str, Any]:
         seconds += head["steps"] / head["rate_hz"]
         vehicle_seconds += len(speed) / head["rate_hz"]
         metres += float(np.abs(speed, dtype=np.float64).sum()) / head["rate_hz"]
-        vehicles += len(head["agents"])
+        classes.update(agent.get("class", VEHICLE) for agent in head["agents"])
         maps.add(head["digests"]["map.json"])
         seeds |= {head["source"]["seed"]} if isinstance(head["source"].get("seed"), int) else set()
         writers.add(str(head["source"].get("writer", "unknown")))
@@ -117,7 +120,8 @@ def _drives(paths: Sequence[Path]) -> dict[str, Any]:
         "towns": len(maps),
         "seeds": len(seeds),
         "hours": round(seconds / 3600, 4),
-        "vehicles": vehicles,
+        "vehicles": classes.total(),  # of all classes
+        "classes": dict(sorted(classes.items())),
         "vehicle_hours": round(vehicle_seconds / 3600, 3),
         "vehicle_km": round(metres / 1000, 2),
         "writers": sorted(writers),
@@ -244,13 +248,19 @@ def card_text(card: dict[str, Any]) -> str:
             f"towns          {drives['towns']} different maps, {drives['seeds']} seeds",
             f"written by     {', '.join(drives['writers'])}; labels {', '.join(drives['labels'])}",
             f"driven         {drives['hours']:.2f} h of traffic",
-            f"vehicles       {drives['vehicles']:,}; {drives['vehicle_hours']:.1f} h, {drives['vehicle_km']:,.0f} km",
+            f"vehicles       {_vehicles(drives)}; {drives['vehicle_hours']:.1f} h, {drives['vehicle_km']:,.0f} km",
         ]
     else:
         lines.append(f"drives         {drives['used']}, none of them here: nothing is known of them")
     for name, entry in card["sets"].items():
         lines += ["", *_set_lines(name, entry, card)]
     return "\n".join(lines) + "\n"
+
+
+def _vehicles(drives: dict[str, Any]) -> str:
+    """Return the number of agents, and how many of them are no vehicles."""
+    others = [f"{count:,} {name}s" for name, count in drives["classes"].items() if name != VEHICLE]
+    return f"{drives['vehicles']:,}" + (f", of them {' and '.join(others)}" if others else "")
 
 
 def _set_lines(name: str, entry: dict[str, Any], card: dict[str, Any]) -> list[str]:

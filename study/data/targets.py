@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from study.config.settings import BirdviewSettings
-from study.episode.schema import Episode
+from study.episode.schema import VEHICLE, Agent, Episode
 from study.errors import BadInputError
 
 FRACTION_BITS = 8  # of the coordinates given to cv2
@@ -27,7 +27,7 @@ Polygon = NDArray[np.int32]
 class Moment(NamedTuple):
     """A moment of an Episode as targets see it.
 
-    `agent` is the index of the ego. `others` and `ego` are the boxes of the other vehicles and of the ego at the next
+    `agent` is the index of the ego. `others` and `ego` are the boxes of the other agents and of the ego at the next
     `settings.future` poses, in the present ego frame.
     """
 
@@ -48,7 +48,7 @@ Target: TypeAlias = Callable[[Moment], Sequence[Polygon]]
 
 
 def pred(moment: Moment) -> Sequence[Polygon]:
-    """Return where the other vehicles will be (Sec. III-B)."""
+    """Return where the other vehicles, cyclists and pedestrians will be (Sec. III-B)."""
     return moment.others
 
 
@@ -77,6 +77,14 @@ def fixed_point(points: Floats, affine: Floats) -> Polygon:
     """Return world points [..., 2] [m] as the fixed-point pixel coordinates of cv2."""
     fixed: Polygon = np.rint((points @ affine[:, :2].T + affine[:, 2]) * (1 << FRACTION_BITS)).astype(np.int32)
     return fixed
+
+
+def painted_sizes(agents: Sequence[Agent], least: float) -> Floats:
+    """Return length and width [A, 2] m as painted: of cyclists and pedestrians at least `least`, or they vanish."""
+    sizes = [(agent.length, agent.width) for agent in agents]
+    least_of = [[0.0 if agent.kind == VEHICLE else least] for agent in agents]
+    painted: Floats = np.maximum(np.array(sizes).reshape(-1, 2), np.array(least_of).reshape(-1, 1))
+    return painted
 
 
 def corners(pose: Floats, length: float | Floats, width: float | Floats) -> Floats:

@@ -12,7 +12,7 @@ from study.episode.chart import parse_map
 from study.episode.fields import BadFieldError
 from study.episode.findings import Findings
 from study.episode.rows import episode_rows, value_faults
-from study.episode.schema import LABELS, Episode
+from study.episode.schema import CLASSES, LABELS, Episode
 
 
 def map_json(episode: Episode) -> dict[str, Any]:
@@ -52,3 +52,5 @@ def _check_head(episode: Episode, findings: Findings) -> None:
     for agent in episode.agents:
         if not (0 < agent.length < 100 and 0 < agent.width < 20):
             refuse(f"agent {agent.id} is {agent.length} m long and {agent.width} m wide")
+        if agent.kind not in CLASSES:
+            refuse(f"the class of agent {agent.id} is '{agent.kind}'; choose from {', '.join(CLASSES)}")

@@ -16,7 +16,7 @@ from study.episode.findings import Findings
 from study.episode.head import combined_digest, file_digest
 from study.episode.recording import FILES, LIGHTS, ROUTES, read_recording
 from study.episode.rows import STATES
-from study.episode.schema import SCHEMA_VERSION, Episode
+from study.episode.schema import SCHEMA_VERSION, VEHICLE, WITH_CLASSES, Agent, Episode
 from study.errors import BadInputError
 
 MOST_DENSE = 40_000_000  # steps x agents: 1.6 GB
@@ -36,18 +36,26 @@ def write_episode(episode: Episode, folder: Path) -> str:
         for file, table in _tables(episode).items():
             pq.write_table(table, draft / file, compression="zstd", compression_level=3)
         digests = {file: file_digest(draft / file) for file in FILES}
+        classes = {agent.id: agent.kind for agent in episode.agents}
+        plain = set(classes.values()) <= {VEHICLE}
         head = {
-            "schema_version": SCHEMA_VERSION,
+            "schema_version": SCHEMA_VERSION if plain else WITH_CLASSES,
             "id": episode.id,
             "source": episode.source,
             "rate_hz": episode.rate_hz,
             "steps": episode.steps,
             "labels": episode.labels,
-            "agents": [vars(agent) for agent in episode.agents],
+            "agents": [_agent_json(agent, plain) for agent in episode.agents],
             "digests": digests,
         }
         (draft / "episode.json").write_text(json.dumps(head, indent=1, allow_nan=False))
-    return combined_digest(digests)
+    return combined_digest(digests, classes)
+
+
+def _agent_json(agent: Agent, plain: bool) -> dict[str, Any]:  # noqa: FBT001
+    fields = dict(vars(agent))
+    kind = fields.pop("kind")
+    return fields if plain else fields | {"class": kind}
 
 
 def _tables(episode: Episode) -> dict[str, pa.Table]:
@@ -76,7 +84,7 @@ def _tables(episode: Episode) -> dict[str, pa.Table]:
 
 
 def read_episode(folder: Path) -> Episode:
-    """Read and check an Episode. Raises BadInputError, with file, row and field, for anything that is not schema 1."""
+    """Read and check an Episode. Raises BadInputError, with file, row and field, for anything else."""
     findings = Findings(folder)
     recording = read_recording(folder, findings)
     findings.refuse()

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from study.episode.schema import SCHEMA_VERSION
+from study.episode.schema import SCHEMA_VERSION, VEHICLE
 from study.errors import BadInputError
 
 
@@ -38,12 +38,16 @@ def file_digest(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def combined_digest(digests: dict[str, str]) -> str:
-    """Return the digest of an Episode from those of its files."""
+def combined_digest(digests: dict[str, str], classes: dict[int, str]) -> str:
+    """Return the digest of an Episode from those of its files and the classes of its agents, by id."""
+    if other := {str(agent): kind for agent, kind in classes.items() if kind != VEHICLE}:
+        digests = digests | {"classes": hashlib.sha256(json.dumps(other, sort_keys=True).encode()).hexdigest()}
     return hashlib.sha256(json.dumps(digests, sort_keys=True).encode()).hexdigest()
 
 
 def episode_digest(folder: Path) -> str:
     """Return the digest that `read_episode` gives, from the head alone. Raises BadInputError where there is none."""
     path = folder / "episode.json"
-    return combined_digest(typed_field(read_json(path), "digests", dict, path))
+    head = read_json(path)
+    classes = {agent["id"]: agent.get("class", VEHICLE) for agent in head.get("agents", ())}
+    return combined_digest(typed_field(head, "digests", dict, path), classes)

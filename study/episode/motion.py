@@ -1,5 +1,7 @@
 """Find motion that no vehicle makes: each agent is judged by its own rows, step by step.
 
+Pedestrians may turn on the spot, step aside and walk hand in hand: their headings and nearness are not judged.
+
 Positions are believed first: a jump splits an agent's rows, and what cannot be reached from its longest stretch is
 wrong. Speeds are held against the distance moved in a second, headings against its direction. Where most of an agent's
 rows disagree, its unit or convention is another one, and all its rows are wrong; otherwise those rows are.
@@ -16,7 +18,7 @@ from numpy.typing import NDArray
 from study.config.settings import DynamicsSettings
 from study.episode.findings import Findings
 from study.episode.rows import Rows, make_unknown
-from study.episode.schema import Agent
+from study.episode.schema import PEDESTRIAN, Agent
 
 JUMP = 2.0, 0.5  # farther than its speed carries it by this much [m] and this share of that, an agent has jumped
 SPEED = 2.0, 0.25  # the same for a second's distance, either way
@@ -43,6 +45,11 @@ def wrap(angle: NDArray[Any]) -> NDArray[Any]:
     """Return the angle, wrapped into half a turn either way."""
     wrapped: NDArray[Any] = np.mod(angle + np.pi, 2 * np.pi) - np.pi
     return wrapped
+
+
+def _walks(rows: Rows, agents: Sequence[Agent]) -> Bools:
+    """Return which rows are of pedestrians."""
+    return np.array([agent.kind == PEDESTRIAN for agent in agents], bool)[rows["agent"]]
 
 
 def _within(values: Floats, spans: Sequence[tuple[float, float]]) -> Bools:
@@ -79,6 +86,7 @@ class _Tracks:
     def __init__(self, rows: Rows, rate: float, agents: Sequence[Agent], findings: Findings) -> None:
         self.rows, self.rate, self.findings = rows, rate, findings
         self.agents = len(agents)
+        self.walks = _walks(rows, agents)
         self.ids = np.array([agent.id for agent in agents], np.int64)[rows["agent"]]
         self.bad = np.zeros(len(self.ids), bool)
         self.contrary = self.bad.copy()  # rows whose steering points the other way, or is in another unit
@@ -203,7 +211,7 @@ class _Tracks:
         start = self.window(2 * half)
         middle = start + half
         dx, dy = (rows[name][start + 2 * half].astype(np.float64) - rows[name][start] for name in "xy")
-        shows = np.hypot(dx, dy) > MOVED
+        shows = (np.hypot(dx, dy) > MOVED) & ~self.walks[middle]
         middle, motion = middle[shows], np.arctan2(dy, dx)[shows]
         motion = np.where(rows["speed"][middle] < 0, motion + np.pi, motion)
         off, way = np.zeros(len(self.ids)), np.zeros(len(self.ids))
@@ -220,6 +228,7 @@ class _Tracks:
         self.bad |= self.add(enough & (share > 0.25), "heading", rule, way=first)
         self.bad |= self.add(off > ACROSS, "heading", rule, way=way)
         spin = np.abs(wrap(np.diff(rows["heading"].astype(np.float64)))) > SPIN
+        spin &= ~self.walks[1:]
         self.bad |= self.add(self.later(spin), "heading", "has turned within a step as no vehicle does")
 
     def find_steering(self) -> None:
@@ -290,7 +299,7 @@ class _Tracks:
 
 def _find_twins(rows: Rows, known: Bools, rate: float, agents: Sequence[Agent], findings: Findings) -> Bools:
     """Return rows of agents that stand where another one stands, for half a second or more; the lower id stays."""
-    good = np.flatnonzero(~known)
+    good = np.flatnonzero(~known & ~_walks(rows, agents))
     good = good[np.lexsort((rows["x"][good], rows["step"][good]))]
     step, agent, x, y = (rows[name][good] for name in ("step", "agent", "x", "y"))
     pairs: list[NDArray[np.int64]] = []

@@ -17,7 +17,18 @@ from study.episode.chart import parse_map, parse_objects
 from study.episode.findings import Findings
 from study.episode.head import combined_digest, file_digest, read_json, typed_field
 from study.episode.rows import Rows, dense_states, positions, read_columns, read_rows, repeated, select
-from study.episode.schema import LABELS, RED, SCHEMA_VERSION, Agent, Episode, Lane, Light
+from study.episode.schema import (
+    CLASSES,
+    LABELS,
+    RED,
+    SCHEMA_VERSION,
+    VEHICLE,
+    WITH_CLASSES,
+    Agent,
+    Episode,
+    Lane,
+    Light,
+)
 from study.errors import BadInputError
 
 FILES = ("map.json", "states.parquet", "lights.parquet", "routes.parquet")
@@ -52,7 +63,8 @@ class Recording:
         states = dense_states(self.rows, self.steps, len(self.agents))
         names = ("id", "source", "rate_hz", "labels", "agents", "lanes", "lights", "light_state", "routes")
         common = {name: getattr(self, name) for name in names}
-        return Episode(**common, **states, digest=combined_digest(self.digests))
+        classes = {agent.id: agent.kind for agent in self.agents}
+        return Episode(**common, **states, digest=combined_digest(self.digests, classes))
 
     def parts(self) -> Iterator[Recording]:
         """Yield the recording cut in time, so that each part is small when dense; a small one is yielded whole.
@@ -129,8 +141,10 @@ def _check_files(folder: Path, head: dict[str, Any]) -> dict[str, str]:
     """Return the digests of the files, which are those in the head."""
     path = folder / "episode.json"
     version = head.get("schema_version")
-    if version != SCHEMA_VERSION:
-        raise BadInputError(f"{path}: schema_version is {version!r}; this program reads {SCHEMA_VERSION}")
+    if version not in (SCHEMA_VERSION, WITH_CLASSES):
+        raise BadInputError(
+            f"{path}: schema_version is {version!r}; this program reads {SCHEMA_VERSION} and {WITH_CLASSES}"
+        )
     digests = typed_field(head, "digests", dict, path)
     for file in FILES:
         if not (folder / file).is_file():
@@ -154,7 +168,8 @@ def _parse_head(path: Path, head: dict[str, Any], findings: Findings) -> tuple[f
         rate = fields.number(head, "rate_hz", "", 0, 10_000)
         steps = fields.integer(head, "steps", "")
         labels = typed_field(head, "labels", str, path)
-        agents = parse_objects(head, "agents", _agent, path.name, findings)
+        version = head["schema_version"]
+        agents = parse_objects(head, "agents", lambda place, row: _agent(place, row, version), path.name, findings)
         if labels not in LABELS:
             raise BadInputError(f"{path}: field 'labels' is '{labels}'; choose from {', '.join(LABELS)}")
         if not 0 <= steps <= MOST_STEPS:
@@ -164,11 +179,15 @@ def _parse_head(path: Path, head: dict[str, Any], findings: Findings) -> tuple[f
     return rate, steps, labels, tuple(agents)
 
 
-def _agent(place: str, row: dict[str, Any]) -> Agent:
+def _agent(place: str, row: dict[str, Any], version: float) -> Agent:
     number = fields.integer(row, "id", place)
     name = f"{place} (agent {number})"
     size = fields.number(row, "length", name, 0, 100), fields.number(row, "width", name, 0, 20)
-    return Agent(number, *size, fields.truth(row, "ego", name, default=True))
+    if "class" in row and version == SCHEMA_VERSION:
+        text = f"field '{name}.class' needs schema_version {WITH_CLASSES} in the head, which is {version}"
+        raise fields.BadFieldError(text, "class")
+    kind = fields.choice(row, "class", name, CLASSES)
+    return Agent(number, *size, fields.truth(row, "ego", name, default=kind == VEHICLE), kind)
 
 
 def _parse_source(source: dict[str, Any], findings: Findings) -> dict[str, Any]:

@@ -1,16 +1,18 @@
-"""The Episode: one recorded drive of everything on a piece of map. Open format, schema version 1.
+"""The Episode: one recorded drive of everything on a piece of map. Open format, schema versions 1 and 1.1.
 
 An Episode is a folder of four files. Right-handed coordinates: x east, y north [m], heading anticlockwise from x [rad].
 
 `episode.json`
-    schema_version  1
+    schema_version  1, or 1.1 where agents have classes; where all are vehicles we write 1, the same bytes as before
     id              the folder's name for people
     source          {"writer": ..., ...}: what wrote it, free keys; "recording": name of what this drive was cut from,
                     if from a longer one: such drives share vehicles, and stay in one set
     rate_hz         steps per second
     steps           number of steps T; step k is at k / rate_hz seconds
     labels          "recorded", "derived" (commands estimated from the motion) or "none"
-    agents          [{"id", "length", "width", "ego"}]: metres; ego: may serve as the ego vehicle
+    agents          [{"id", "length", "width", "ego", "class"}]: metres; ego: may serve as the ego vehicle; class, in
+                    1.1 only: "vehicle" (the default), "cyclist" or "pedestrian"; ego defaults to true for vehicles,
+                    to false for the others
     digests         {file name: sha256} of the other three files
 `map.json`
     lanes           [{"id", "centre": [[x, y], ...], "width", "left", "right", "junction", "speed_limit"}]
@@ -42,11 +44,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION, WITH_CLASSES = 1, 1.1
 RATE_HZ = 10.0  # of history and future (Sec. III-A)
 GREEN, YELLOW, RED = 0, 1, 2
 LABELS = ("recorded", "derived", "none")
 OPTIONAL_FLOATS = ("steering", "acceleration", "light_distance", "route_s", "lead_gap")
+VEHICLE, CYCLIST, PEDESTRIAN = CLASSES = ("vehicle", "cyclist", "pedestrian")
 BORDERS = ("none", "dashed", "solid", "curb")
 
 FloatTA = NDArray[np.float32]
@@ -76,12 +79,18 @@ class Light:
 
 @dataclass(frozen=True)
 class Agent:
-    """One vehicle's size [m]; `ego` says whether it may serve as the ego vehicle."""
+    """One agent's size [m] and class; `ego` says whether it may serve as the ego, by default only a vehicle."""
 
     id: int
     length: float
     width: float
-    ego: bool = True
+    ego: bool = None  # type: ignore[assignment]  # until the class is known
+    kind: str = VEHICLE
+
+    def __post_init__(self) -> None:
+        """Fill in `ego`."""
+        if self.ego not in (True, False):
+            object.__setattr__(self, "ego", self.kind == VEHICLE)
 
 
 @dataclass(frozen=True)
