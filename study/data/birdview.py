@@ -34,12 +34,8 @@ PLAIN_SURFACE = 80  # grey where all lanes have one limit, and that of 40 km/h
 LIMIT_STEP, LIMIT_SHADES = 5 / 3.6, 20  # [m/s]; limits of 95 km/h and more look alike
 BOUNDARY, LINE = 176, 255  # greys of curbs and of lane lines
 BOUNDARY_WIDTH, LINE_WIDTH, ROUTE_WIDTH = 0.5, 0.3, 2.0  # [m]
-AGENTS = {  # palette of poses, RGB; who they are of: the class, but for the ego
-    VEHICLE: (255, 255, 0),
-    "ego": (0, 0, 255),
-    CYCLIST: (128, 255, 0),
-    PEDESTRIAN: (255, 128, 0),
-}
+# Palette of poses, RGB: by class, but for the ego
+AGENTS = {VEHICLE: (255, 255, 0), "ego": (0, 0, 255), CYCLIST: (128, 255, 0), PEDESTRIAN: (255, 128, 0)}
 LEAST = 1.6  # side of a painted cyclist or pedestrian at least [pixels of the image]: any such square sets a mask
 DASH = 3.0  # [m], length of a dash and of the gap behind it
 ROUTE_POINTS = 2.0  # [m] apart: 0.1 m off on the tightest turn of a car
