@@ -240,8 +240,8 @@ class Renderer:
         half = self._sizes[agent] * (scale / 2) - 0.5
         sine, cosine, corners = np.sin(turn), np.cos(turn), np.empty((len(turn), 4, 2))
         for axis, middle, along, across in ((0, column, -sine, -cosine), (1, row, -cosine, sine)):
-            along, across = along * half[:, 0], across * half[:, 1]
-            front, back = along + across, along - across
+            ahead, aside = along * half[:, 0], across * half[:, 1]
+            front, back = ahead + aside, ahead - aside
             for corner, shift in enumerate((front, back, -front, -back)):
                 corners[:, corner, axis] = middle + shift
         fixed = np.rint(corners * (1 << FRACTION_BITS)).astype(np.int32)
