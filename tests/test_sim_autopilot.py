@@ -1,6 +1,7 @@
 """The autopilot: its commands, the lights, and who goes first."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -105,13 +106,13 @@ def test_traffic_flows_without_collisions(town: Drive) -> None:
 
 
 def crossing_pair(road: Traffic) -> tuple[int, int]:
-    """Return a left turn and the oncoming straight movement that it crosses."""
+    """Return a turn that yields and the oncoming straight movement that it crosses."""
     town = road.town
-    for a, left in enumerate(town.movements):
+    for a, turn in enumerate(town.movements):
         for b, other in enumerate(town.movements):
             meet = town.opposing[a, b] and not np.isnan(town.enter[a, b])
-            room = min(town.strips[m.entry].piece.length for m in (left, other)) > 30
-            if left.turn == "left" and other.turn == "straight" and meet and room:
+            room = min(town.strips[m.entry].piece.length for m in (turn, other)) > 30
+            if turn.turn == town.yielding and other.turn == "straight" and meet and room:
                 return a, b
     raise AssertionError("no such pair in this town")
 
@@ -139,19 +140,20 @@ def until_green(road: Traffic, movement: int) -> None:
         road.steps += 1
 
 
-def test_a_left_turn_lets_oncoming_traffic_pass_and_then_goes() -> None:
-    road = make_traffic(TownSettings(vehicles=2, green=20.0), 0)
-    left, straight = crossing_pair(road)
-    send(road, 0, left, 15.0, 6.0)
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_a_turn_across_oncoming_traffic_lets_it_pass_and_then_goes(side: Literal["right", "left"]) -> None:
+    road = make_traffic(TownSettings(vehicles=2, green=20.0, traffic=side), 0)
+    turn, straight = crossing_pair(road)
+    send(road, 0, turn, 15.0, 6.0)
     send(road, 1, straight, 25.0, 9.0)
-    until_green(road, left)
+    until_green(road, turn)
     done: dict[int, int] = {}
     braked = False
     for step in range(250):
         road.act()
         braked |= 0 not in done and road.vehicles[0].speed < 0.5
         road.step(DT)
-        for slot, movement in ((0, left), (1, straight)):
+        for slot, movement in ((0, turn), (1, straight)):
             passed = road.fleet.move[slot] != movement
             done.setdefault(slot, step) if passed else None
         if len(done) == 2:
@@ -161,21 +163,22 @@ def test_a_left_turn_lets_oncoming_traffic_pass_and_then_goes() -> None:
     assert road.collided == 0
 
 
-def test_a_left_turn_with_nobody_oncoming_does_not_wait() -> None:
-    road = make_traffic(TownSettings(vehicles=2, green=20.0), 0)
-    left, _ = crossing_pair(road)
-    send(road, 0, left, 15.0, 6.0)
-    node = road.town.movements[left].node
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_a_turn_with_nobody_oncoming_does_not_wait(side: Literal["right", "left"]) -> None:
+    road = make_traffic(TownSettings(vehicles=2, green=20.0, traffic=side), 0)
+    turn, _ = crossing_pair(road)
+    send(road, 0, turn, 15.0, 6.0)
+    node = road.town.movements[turn].node
     far = next(k for k, m in enumerate(road.town.movements) if road.town.phases[m.node] and m.node != node)
     send(road, 1, far, 20.0, 0.0)
-    until_green(road, left)
+    until_green(road, turn)
     for _ in range(60):
         road.act()
         road.step(DT)
-        if road.fleet.move[0] != left:
+        if road.fleet.move[0] != turn:
             break
         assert road.vehicles[0].speed > 3
-    assert road.fleet.move[0] != left
+    assert road.fleet.move[0] != turn
 
 
 def test_cross_traffic_waits_for_a_vehicle_left_inside_the_junction() -> None:

@@ -62,6 +62,11 @@ class TownSettings(Settings):
         default=False,
         description="a new town for every drive; else one for all, drawn from recording.seed (literal)",
     )
+    traffic: Literal["right", "left"] = Field(
+        "right",
+        description="side of the road on which vehicles drive; left is the mirror image of the same town",
+        exclude_if=lambda side: side == "right",  # what was made before the setting keeps its key and its bytes
+    )
 
     @model_validator(mode="after")
     def _block_in_order(self) -> Self:

@@ -255,7 +255,7 @@ def _probe(arrays: Arrays) -> dict[str, float]:
 
 def _settings(record: SweepRecord) -> Iterator[Setting]:
     for group, model in record.settings:
-        shown = model.model_dump(mode="json")
+        shown = dict(model) | model.model_dump(mode="json")  # which may leave out what is at its default
         for name, info in type(model).model_fields.items():
             yield Setting(
                 group=group,

@@ -85,7 +85,7 @@ class Fleet:
         self.brake_until = np.zeros(vehicles, np.int64)
         moves = town.movements
         self.move_exit = np.array([move.exit for move in moves], np.int64)
-        self.move_left = np.array([move.turn == "left" for move in moves], bool)
+        self.move_yields = np.array([move.turn == town.yielding for move in moves], bool)
         self.move_signal = np.array([town.signal_of[move.entry] for move in moves], np.int64)
         self.move_length = np.array([move.length for move in moves])
         self.street_length = np.array([strip.piece.length for strip in town.strips])
@@ -342,11 +342,11 @@ class Fleet:
         a, b = self.move[i], self.move[j]
         into_i, out_i, into_j, out_j = town.enter[a, b], town.leave[a, b], town.enter[b, a], town.leave[b, a]
         open_ = (front[i] - LENGTH < out_i) & (front[j] - LENGTH < out_j) & (front[i] <= into_i)
-        begun = np.where(self.move_left[b], np.minimum(into_j, self.first_crossing[b]), into_j)
+        begun = np.where(self.move_yields[b], np.minimum(into_j, self.first_crossing[b]), into_j)
         taken = (front[j] > begun) & open_
         across = town.opposing[a, b]
-        yields = across & self.move_left[a] & ~self.move_left[b]
-        # From across: a left turn waits for vehicles that can arrive before it is through.
+        yields = across & self.move_yields[a] & ~self.move_yields[b]
+        # From across: a turn that crosses waits for vehicles that can arrive before it is through.
         stuck = (lead[j] >= 0) & (lead_gap[j] < into_j - front[j]) & (speed[lead[j]] < 2)
         soon = _time(into_j - front[j], speed[j], 2.5, 12.0) < GAP_MARGIN + self.dynamics.lag + _time(
             out_i + LENGTH - front[i], speed[i], 1.7, 9.0

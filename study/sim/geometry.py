@@ -47,6 +47,10 @@ class Piece:
         """Return the piece, shifted by (dx, dy) [m]."""
         return Piece(self.x + dx, self.y + dy, self.heading, self.curvature, self.length)
 
+    def mirrored(self) -> Piece:
+        """Return the piece, reflected in the x axis."""
+        return Piece(self.x, -self.y, -self.heading, -self.curvature, self.length)
+
 
 def _direction(arm: int) -> tuple[float, float, float]:
     """Return unit vector and heading from a node into an arm, exact, so that streets lie exactly along the axes."""

@@ -1,14 +1,15 @@
 """A town drawn from a seed: a grid of streets with signalised junctions, as pieces of lane with their right of way.
 
 Coordinates are highway-env's: x east, y *south* [m], so headings grow clockwise and positive lateral is to the right.
-Right-hand traffic. A piece is a straight or an arc, so each is exactly one highway-env lane. Streets end at the stop
-line of their junction; movements (one or two pieces) lead from there to the streets behind it.
+Drawn for right-hand traffic; a town of left-hand traffic is its mirror image. A piece is a straight or an arc, so each
+is exactly one highway-env lane. Streets end at the stop line of their junction; movements (one or two pieces) lead from
+there to the streets behind it.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import networkx as nx
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from study.config.settings import TownSettings
 from study.errors import BadInputError
-from study.sim.geometry import CORNER, LANE_WIDTH, Floats, Piece, pose_at
+from study.sim.geometry import CORNER, LANE_WIDTH, Floats, Piece, Turn, pose_at
 from study.sim.junction import Junction, Movement, Strip, draw_junction, junction_borders
 
 BEND = (14.0, 20.0)  # from the corner of a bend to where its arc starts [m]
@@ -42,8 +43,9 @@ class Town:
 
     `enter`, `leave`: [M, M] m, where along movement a the front bumper enters, and the rear bumper leaves, the space of
     vehicles on movement b; NaN if they never meet.
-    `opposing`: [M, M] bool, whether b comes from the arm across. `signal_of`: strip -> its signal, -1 where none.
-    `phases`: node -> number of phases of its lights, 0 where there are none.
+    `opposing`: [M, M] bool, whether b comes from the arm across. `yielding`: the turn that lets those pass.
+    `signal_of`: strip -> its signal, -1 where none. `phases`: node -> number of phases of its lights, 0 where there are
+    none.
     """
 
     strips: tuple[Strip, ...]
@@ -55,6 +57,7 @@ class Town:
     enter: Floats
     leave: Floats
     opposing: NDArray[np.bool_]
+    yielding: Turn = "left"
 
 
 def highway_lane(strip: Strip) -> AbstractLane:
@@ -154,7 +157,7 @@ def draw_town(settings: TownSettings, rng: np.random.Generator) -> Town:
     for _ in range(100):
         town = _lay_out(settings, streets, limits, (xs, ys), rng)
         if _all_reachable(town):
-            return town
+            return town if settings.traffic == "right" else _mirrored(town)
     raise BadInputError(
         f"town: no way was found to give {settings.two_lane_share:.0%} of the streets two lanes (two_lane_share) so "
         "that every lane leads to every other; take another share, a larger grid or another seed"
@@ -188,6 +191,20 @@ def _lay_out(
     for node in range(nodes):
         draft.add_junction(node)
     return draft.finish()
+
+
+def _mirrored(town: Town) -> Town:
+    """Return the town of the other side's traffic: its reflection in the x axis, where every left is a right."""
+    turns: dict[Turn, Turn] = {"left": "right", "straight": "straight", "right": "left"}
+    return replace(
+        town,
+        strips=tuple(
+            replace(strip, piece=strip.piece.mirrored(), left=strip.right, right=strip.left) for strip in town.strips
+        ),
+        movements=tuple(replace(way, arm=-way.arm % 4, turn=turns[way.turn]) for way in town.movements),
+        signals=tuple(replace(signal, stop_line=signal.stop_line * [1, -1]) for signal in town.signals),
+        yielding=turns[town.yielding],
+    )
 
 
 def _all_reachable(town: Town) -> bool:
