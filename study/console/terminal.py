@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Sequence
+from typing import TypeVar
 
 from rich.console import Console
 from rich.live import Live
+from rich.progress import track
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
+
+Item = TypeVar("Item")
 
 
 def print_table(rows: Sequence[Sequence[str]], styles: Sequence[str]) -> None:
@@ -33,3 +37,8 @@ def live_part() -> Live | None:
     """Return the part of the terminal that is drawn again and again, or None where stderr is no terminal."""
     console = Console(file=sys.stderr)
     return Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
+
+
+def follow(items: Iterable[Item], count: int, words: str) -> Iterable[Item]:
+    """Return the items, and show on stderr how many of `count` are through and how long the others will take."""
+    return track(items, words, count, console=Console(file=sys.stderr), transient=True)

@@ -38,7 +38,7 @@ def convert(sources: Sequence[Path], out: Path, cut: float) -> list[str]:
         raise BadInputError(
             "commonroad-io is not installed: pip install 'study[commonroad]', then pip install --no-deps commonroad-io"
         )
-    return write_drives(_recordings(sources), out, cut)
+    return write_drives(_recordings(sources), len(sources), out, cut)
 
 
 def _recordings(sources: Sequence[Path]) -> Iterator[Recording]:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from study.atomic import atomic_folder
+from study.console.terminal import follow
 from study.episode.adapt import resample
 from study.episode.chart import REACH
 from study.episode.files import write_episode
@@ -23,8 +24,8 @@ from study.errors import BadInputError
 SHORTEST = 3.0  # a recording below it has no moment with a second of history and one of future [s]
 
 
-def write_drives(recordings: Iterable[Recording], out: Path, cut: float) -> list[str]:
-    """Write the recordings below `out` as drives of about `cut` seconds each, and return a line about each drive.
+def write_drives(recordings: Iterable[Recording], count: int, out: Path, cut: float) -> list[str]:
+    """Write `count` recordings below `out` as drives of about `cut` seconds each, and return a line about each drive.
 
     All drives are at 10 Hz and have an agent that may be ego. Nothing is written when anything is wrong.
     Raises BadInputError when `out` holds something, when no drive is left, and for rates below 2 Hz.
@@ -33,7 +34,7 @@ def write_drives(recordings: Iterable[Recording], out: Path, cut: float) -> list
         raise BadInputError(f"{out} holds something; name a new folder with --out")
     lines = []
     with atomic_folder(out) as draft:
-        for recording in recordings:
+        for recording in follow(recordings, count, "converting"):
             for part in _parts(recording, cut):
                 episode = resample(part.episode(), recording.id)
                 write_episode(episode, draft / part.id)

@@ -44,7 +44,8 @@ def convert(sources: Sequence[Path], out: Path, cut: float, maps: Sequence[Path]
     if len(maps) > 1 and len(maps) != len(tracks):
         raise BadInputError(f"--map is given {len(maps)} times for {len(tracks)} recordings; give one, or one for each")
     every = maps if len(maps) > 1 else [*maps, None][:1] * len(tracks)
-    return write_drives((_recording(path, lanes) for path, lanes in zip(tracks, every, strict=True)), out, cut)
+    recordings = (_recording(path, lanes) for path, lanes in zip(tracks, every, strict=True))
+    return write_drives(recordings, len(tracks), out, cut)
 
 
 def _recording(path: Path, lane_map: Path | None) -> Recording:

@@ -54,8 +54,9 @@ def convert(
         raise BadInputError(f"{sources[0]} is a net; give its FCD output with --fcd, or a .sumocfg in its place")
     if fcd:
         net = read_net(sources[0], lights)
-        return write_drives((_recording(net, read_fcd(path, net, routes, tls_states), {}) for path in fcd), out, cut)
-    return write_drives(_runs(scenarios, lights, drives, warm_up, seconds), out, cut)
+        recordings = (_recording(net, read_fcd(path, net, routes, tls_states), {}) for path in fcd)
+        return write_drives(recordings, len(fcd), out, cut)
+    return write_drives(_runs(scenarios, lights, drives, warm_up, seconds), len(scenarios) * drives, out, cut)
 
 
 def _runs(scenarios: Sequence[Path], lights: bool, drives: int, warm_up: float, seconds: float) -> Iterator[Recording]:  # noqa: FBT001

@@ -231,19 +231,22 @@ class _Tracks:
         spin &= ~self.walks[1:]
         self.bad |= self.add(self.later(spin), "heading", "has turned within a step as no vehicle does")
 
+    def _turns(self) -> tuple[NDArray[np.int64], Floats]:
+        """Return the rows with a quarter of a second of their agent on both sides, and how fast it turns [rad/s]."""
+        heading, half = self.rows["heading"].astype(np.float64), max(1, round(self.rate / 4))
+        start = self.window(2 * half)
+        return start + half, wrap(heading[start + 2 * half] - heading[start]) * self.rate / (2 * half)
+
     def find_steering(self) -> None:
         """Compare the sign of steering with that of turns: left is positive."""
-        rows, half = self.rows, max(1, round(self.rate / 4))
+        rows = self.rows
         if "steering" not in rows:
             return
-        start = self.window(2 * half)
-        middle = start + half
-        heading = rows["heading"].astype(np.float64)
-        turned = wrap(heading[start + 2 * half] - heading[start]) * self.rate / (2 * half)
+        middle, turned = self._turns()
         speed = np.maximum(np.abs(rows["speed"][middle].astype(np.float64)), 0.1)
         wheel = rows["steering"][middle].astype(np.float64) * DynamicsSettings().steering_unit
         shows = (rows["speed"][middle] > 2) & (np.abs(turned / speed) > TURNING[0]) & (np.abs(wheel) > TURNING[1])
-        judged, wrong = np.zeros(len(heading), bool), np.zeros(len(heading), bool)
+        judged, wrong = np.zeros((2, len(rows["heading"])), bool)
         judged[middle[shows]] = True
         wrong[middle[shows & (turned * wheel < 0)]] = True
         enough, share = self.share(wrong, judged)
@@ -253,13 +256,10 @@ class _Tracks:
 
     def find_steering_unit(self, length: Floats) -> None:
         """Hold steering against the wheel angle that its path needs, for axles the agent's `length` apart [m]."""
-        rows, half = self.rows, max(1, round(self.rate / 4))
+        rows = self.rows
         if "steering" not in rows:
             return
-        start = self.window(2 * half)
-        middle = start + half
-        heading = rows["heading"].astype(np.float64)
-        turned = wrap(heading[start + 2 * half] - heading[start]) * self.rate / (2 * half)
+        middle, turned = self._turns()
         speed = rows["speed"][middle].astype(np.float64)
         value = rows["steering"][middle].astype(np.float64)
         slip = np.arcsin(np.clip(turned * length[middle] / (2 * np.maximum(speed, 1)), -0.9, 0.9))
