@@ -6,6 +6,8 @@ One engine serves the module: two workers, and one that believes to have a GPU, 
 import gc
 import os
 import signal
+import subprocess
+import sys
 import time
 from collections import Counter
 from operator import mul
@@ -140,6 +142,19 @@ def test_a_gpu_whose_worker_restarts_is_waited_for(engine, tmp_path, monkeypatch
     dies = flow(die, (tmp_path / "diary", 1), accelerated=True)
     waits = flow(environment, *[("CUDA_VISIBLE_DEVICES",)] * 2, accelerated=True)
     assert run_and_record(engine, {"dies": dies, "waits": waits}).products == {"dies": ["alive"], "waits": [GPU, GPU]}
+
+
+def test_a_process_that_ends_at_once_leaves_no_semaphores_and_says_nothing_of_them(tmp_path):
+    code = (
+        "import os, re; from pathlib import Path; from study.engine.local import local_engine\n"
+        f"engine = local_engine(1, Path({str(tmp_path)!r}))\n"
+        "print(*set(re.findall('/dev/shm/sem[.]\\\\S+', Path('/proc/self/maps').read_text())), flush=True)\n"
+        "os._exit(130)"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stderr) == (130, "")
+    assert ended.stdout.split()
+    assert not any(Path(semaphore).exists() for semaphore in ended.stdout.split())
 
 
 def test_a_worker_that_dask_has_given_up_is_replaced(tmp_path, monkeypatch):

@@ -277,6 +277,7 @@ def test_a_stopped_sweep_ends_within_five_seconds_and_says_how_to_go_on(undistur
         assert time.monotonic() - began < 5 * undisturbed.slowdown
         assert HINT in run.output
         assert "Traceback" not in run.output
+        assert "leaked" not in run.output
     run = CommandProcess(folder, *sweep_command(*TWO))
     assert run.wait() == 0, run.output
     assert_same_outcome(folder, undisturbed.folder)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import signal
 from collections.abc import Sequence
 from functools import partial
@@ -35,7 +36,7 @@ def local_engine(workers: int, scratch: Path, gpus: Sequence[str] = ()) -> DaskE
     kinds = [{"resources": {GPU: 1}, "env": {"CUDA_VISIBLE_DEVICES": name}} for name in gpus]
     kinds += [{"env": {"CUDA_VISIBLE_DEVICES": ""}} if gpus else {} for _ in range(workers)]
     address = {"host": "127.0.0.1", "port": 0, "dashboard": False, "dashboard_address": "127.0.0.1:0"}
-    resource_tracker.ensure_running()  # starting it later would unblock the signal
+    _start_resource_tracker()  # starting it later would unblock the signal
     # A terminal sends Ctrl-C to every process, and this process alone handles it. Threads that start here inherit the
     # blocked signal, and so do the workers.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -50,3 +51,18 @@ def local_engine(workers: int, scratch: Path, gpus: Sequence[str] = ()) -> DaskE
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
     # A worker that does not come back in time is given up by Dask, and started anew when the cluster is scaled again.
     return DaskEngine(client, cluster.scheduler_address, cluster, partial(cluster.scale, len(kinds)))
+
+
+def _start_resource_tracker() -> None:
+    """Start the process of Python's that removes the semaphores of Dask's queues when this process ends at once.
+
+    It would warn of "leaked semaphore objects" then, although a stopped command leaves them to it on purpose.
+    """
+    before = os.environ.get("PYTHONWARNINGS")
+    os.environ["PYTHONWARNINGS"] = ",".join(filter(None, [before, "ignore:resource_tracker:UserWarning"]))
+    try:
+        resource_tracker.ensure_running()
+    finally:
+        del os.environ["PYTHONWARNINGS"]
+        if before is not None:
+            os.environ["PYTHONWARNINGS"] = before
