@@ -67,6 +67,11 @@ class TownSettings(Settings):
         description="side of the road on which vehicles drive; left is the mirror image of the same town",
         exclude_if=lambda side: side == "right",  # what was made before the setting keeps its key and its bytes
     )
+    pedestrians: Annotated[int, Field(ge=0)] = Field(
+        0,
+        description="pedestrians, who walk along kerbs and cross arms of junctions while their light is red",
+        exclude_if=lambda count: count == 0,  # what was made before the setting keeps its key and its bytes
+    )
 
     @model_validator(mode="after")
     def _block_in_order(self) -> Self:

@@ -11,8 +11,8 @@ from PIL import Image as Pillow
 from PIL import ImageDraw, ImageFont
 
 from study.config.paper import ACCELERATIONS, IMAGE
-from study.data.targets import FRACTION_BITS, Floats, corners, fixed_point
-from study.episode.schema import Episode
+from study.data.targets import FRACTION_BITS, Floats, corners, fixed_point, painted_sizes
+from study.episode.schema import VEHICLE, Episode
 from study.figures.style import BLUE, FRACTION_COLOUR, GREY, VERMILION
 
 Image = NDArray[np.uint8]
@@ -20,6 +20,7 @@ Colour = tuple[int, int, int]
 
 SIDE = 4 * IMAGE  # of the town's and of the view's picture [px]
 WORDS = 80  # height of the words below [px]
+LEAST = 1.5  # side of a cyclist or pedestrian at least, as painted [m]
 SCALE = 2.56  # of the town's picture [px/m]: 100 m a side
 ROAM, AHEAD = 25.0, 15.0  # the picture stands still until the ego is so far from its middle, then looks ahead [m]
 WORD_OF_LEVEL = dict(zip(ACCELERATIONS, ("brake", "keep", "go"), strict=True))
@@ -55,6 +56,7 @@ class Scene:
         self.episode, self.ego, self.crop, self.first = episode, ego, crop, first
         self._fonts = [ImageFont.load_default(size) for size in (12, 16)]
         self._labels: dict[tuple[str, Colour, int], Pillow.Image] = {}
+        self._sizes = painted_sizes(episode.agents, LEAST)
         self._middle = np.full(2, np.inf)  # of the town's picture [m]
         points = np.concatenate([lane.centre for lane in episode.lanes] or [np.zeros((1, 2))])
         margin = SIDE / SCALE
@@ -103,7 +105,8 @@ class Scene:
         near[ego] = False
         agents = [*np.flatnonzero(near).tolist(), ego]
         for agent, box in zip(agents, self._boxes(poses[agents], affine, agents), strict=True):
-            cv2.fillConvexPoly(picture, box, EGO if agent == ego else OTHERS, cv2.LINE_AA, FRACTION_BITS)
+            colour = EGO if agent == ego else OTHERS if episode.agents[agent].kind == VEHICLE else INK
+            cv2.fillConvexPoly(picture, box, colour, cv2.LINE_AA, FRACTION_BITS)
         return picture
 
     def _cut(self) -> tuple[Floats, Image]:
@@ -114,19 +117,19 @@ class Scene:
         return affine, self._map[row : row + SIDE, column : column + SIDE].copy()
 
     def crash(self, picture: Image, collision: dict[str, Any]) -> None:
-        """Mark in the frame drawn last where the ego and the other vehicle stood when they met."""
+        """Mark in the frame drawn last where the ego and the other agent stood when they met."""
         affine, _ = self._cut()
         town = picture[:SIDE, :SIDE].copy()
         poses = np.array([collision["other"][:3], collision["ego"][:3]])
-        for box, colour in zip(self._boxes(poses, affine, [self.ego] * 2), (OTHERS, EGO), strict=True):
+        other = [agent.id for agent in self.episode.agents].index(collision["agent"])
+        for box, colour in zip(self._boxes(poses, affine, [other, self.ego]), (OTHERS, EGO), strict=True):
             cv2.fillConvexPoly(town, box, colour, cv2.LINE_AA, FRACTION_BITS)
             cv2.polylines(town, [box], True, WARNING, 2, cv2.LINE_AA, FRACTION_BITS)  # noqa: FBT003
         picture[:SIDE, :SIDE] = town
 
     def _boxes(self, poses: Floats, affine: Floats, agents: list[int]) -> NDArray[np.int32]:
         """Return the boxes [N, 4, 2] of agents at poses [N, 3] in fixed-point pixels."""
-        sizes = np.array([(self.episode.agents[agent].length, self.episode.agents[agent].width) for agent in agents])
-        return fixed_point(corners(poses, *sizes.T).reshape(-1, 2), affine).reshape(-1, 4, 2)
+        return fixed_point(corners(poses, *self._sizes[agents].T).reshape(-1, 2), affine).reshape(-1, 4, 2)
 
     def _words(self, step: int, command: int) -> Image:
         """Return the words below a frame: time, speed, steering, acceleration and light."""

@@ -13,9 +13,9 @@ from study.analysis.comfort import comfortable
 from study.data.targets import corners
 from study.driving.faults import at_fault
 from study.driving.surface import off_road
-from study.episode.schema import RED, Episode
+from study.episode.schema import PEDESTRIAN, RED, Agent, Episode
 
-VEHICLE, LAYOUT, RED_LIGHT = 0.60, 0.65, 0.70  # penalties of the CARLA leaderboard, for each infraction
+WALKER, VEHICLE, LAYOUT, RED_LIGHT = 0.50, 0.60, 0.65, 0.70  # penalties of the CARLA leaderboard, for each infraction
 KERB = 0.3  # a corner this far beyond every lane is over the kerb [m]
 
 Floats = NDArray[np.float64]
@@ -32,8 +32,8 @@ class DriveScores:
     `route_completion`: way made along the planned route, as a share of the expert's way in the same drive, at most 1
         (the leaderboard's route has an end; ours goes on, so the expert's way is its length, as in nuPlan's
         ego_progress_along_expert_route).
-    `driving_score`: 100 x route completion x the product of the penalties, one for each infraction: 0.60 a collision
-        with a vehicle, 0.65 a layout infraction, 0.70 a red light (CARLA leaderboard 1.0).
+    `driving_score`: 100 x route completion x the product of the penalties, one for each infraction: 0.50 a collision
+        with a pedestrian, 0.60 with a vehicle, 0.65 a layout infraction, 0.70 a red light (CARLA leaderboard 1.0).
     `success`: 1 when the actor drove for the whole time without any infraction, else 0.
     `collision`: 1 when the drive ended in one; `at_fault`: 1 when that was the ego's fault (nuPlan, `faults`).
     `red_lights`: stop lines that the front bumper crossed while the light was red (the leaderboard's test).
@@ -97,7 +97,12 @@ def score_drive(episode: Episode, route_length: float) -> DriveScores:
     ended, collision = facts["ended"], facts["collision"]
     completion = float(np.clip(progress(episode) / max(route_length, 1e-9), 0, 1))
     reds, layout = _red_lights(track), _layout(track, episode)
-    penalties = VEHICLE ** (ended == "collision") * LAYOUT**layout * RED_LIGHT**reds
+    other = _other(collision, episode)
+    penalties = (
+        (WALKER if other and other.kind == PEDESTRIAN else VEHICLE) ** (ended == "collision")
+        * LAYOUT**layout
+        * RED_LIGHT**reds
+    )
     time = len(track.speed) / episode.rate_hz
     distance = float(track.speed.sum()) / episode.rate_hz
     changes = np.diff(track.steering) * episode.rate_hz
@@ -106,7 +111,7 @@ def score_drive(episode: Episode, route_length: float) -> DriveScores:
         driving_score=100 * completion * penalties,
         success=float(ended == "time" and not reds and not layout),
         collision=float(ended == "collision"),
-        at_fault=float(_at_fault(collision, episode)),
+        at_fault=float(_at_fault(collision, other, episode)),
         red_lights=float(reds),
         layout=float(layout),
         off_route=float(ended == "off route"),
@@ -120,10 +125,16 @@ def score_drive(episode: Episode, route_length: float) -> DriveScores:
     )
 
 
-def _at_fault(collision: dict[str, list[float]] | None, episode: Episode) -> bool:
-    if collision is None:
+def _other(collision: dict[str, Any] | None, episode: Episode) -> Agent | None:
+    """Return the agent that the ego collided with."""
+    return next((agent for agent in episode.agents if collision and agent.id == collision["agent"]), None)
+
+
+def _at_fault(collision: dict[str, Any] | None, other: Agent | None, episode: Episode) -> bool:
+    if collision is None or other is None:
         return False
-    return at_fault(np.array(collision["ego"]), np.array(collision["other"]), episode.lanes)
+    poses = np.array(collision["ego"]), np.array(collision["other"])
+    return at_fault(*poses, episode.lanes, (other.length, other.width))
 
 
 def collisions_per_km(scores: Sequence[DriveScores], *, at_fault: bool) -> float:

@@ -14,12 +14,11 @@ from study.data.birdview import Image, Renderer
 from study.data.limits import Limits
 from study.data.true_state import Columns, live_state
 from study.driving.drives import Drive
-from study.episode.schema import Agent, Episode
+from study.episode.schema import Episode
 from study.errors import BadInputError
 from study.randomness import rng
 from study.sim.dynamics import DT
 from study.sim.env import OFF_ROUTE, make_traffic
-from study.sim.geometry import LENGTH, WIDTH
 from study.sim.record import STANDING, Recorder, route_line, town_map
 
 BLOCKED = 10.0  # standing this long while the expert, in its place, would go [s]
@@ -68,6 +67,7 @@ class Ride:
         network = self.road.network
         fixed = [self.settings, self.drive, self.road.town, self.road.lights, network, self.map, self.route]
         fixed += [self.road.fleet.town, self.renderer, self.known]
+        fixed += [self.road.pedestrians.walks] if self.road.pedestrians else []
         return copy.deepcopy(self, {id(item): item for item in fixed})
 
     def observe(self) -> None:
@@ -154,16 +154,19 @@ class Ride:
             self.ended = "time"
 
     def _collision(self) -> dict[str, Any]:
-        """Return number and pose of the other vehicle, the nearest that has crashed, and the ego's pose."""
-        x, y, heading, speed = self.road.crash_pose
-        others = [slot for slot in self.road.crashed if slot != self.slot]
-        away = [float(np.hypot(x[slot] - x[self.slot], y[slot] - y[self.slot])) for slot in others]
-        other = others[int(np.argmin(away))]
-        poses = {
-            name: [float(x[slot]), float(-y[slot]), float(-heading[slot]), float(speed[slot])]
-            for name, slot in (("ego", self.slot), ("other", other))
-        }
-        return {"agent": int(self.recorder.seen[-1]["agent"][other]), **poses}
+        """Return number and pose of the pedestrian hit, or else of the nearest vehicle that crashed, and the ego's."""
+        road, slot = self.road, self.slot
+        met = dict(road.hits).get(slot)
+        if met is not None and road.pedestrians:
+            agent, pose = road.walkers[met], np.stack(road.pedestrians.pose())[:, met]
+        else:
+            others = np.array([other for other in road.crashed if other != slot])
+            x, y, _, _ = road.crash_pose
+            other = others[np.hypot(x[others] - x[slot], y[others] - y[slot]).argmin()]
+            agent, pose = int(self.recorder.seen[-1]["agent"][other]), np.stack(road.crash_pose)[:, other]
+        ego = np.stack(road.crash_pose)[:, slot]
+        poses = {name: (values * [1, -1, -1, 1]).tolist() for name, values in (("ego", ego), ("other", pose))}
+        return {"agent": agent, **poses}
 
     @property
     def live(self) -> Episode:
@@ -182,7 +185,7 @@ class Ride:
             source={},
             rate_hz=1 / DT,
             labels="recorded",
-            agents=tuple(Agent(number, LENGTH, WIDTH) for number in range(columns)),
+            agents=tuple(self.recorder.agent(number) for number in range(columns)),
             lanes=lanes,
             lights=lights,
             light_state=self.recorder.light_state,

@@ -219,11 +219,13 @@ class Fleet:
         controls: tuple[Floats, Floats],
         pairs: tuple[Ints, Ints],
         lights: NDArray[np.uint8],
+        crossings: Floats | float = np.inf,
     ) -> Decisions:
         """Return every vehicle's command from `pose` (x, y, heading, speed) after `follow`.
 
         `controls`: acceleration [m/s2] and wheel angle [rad] that act now, the answers to earlier commands.
         `pairs`: each (i, j), sorted, of vehicles within at least REACH of each other; `lights`: states of the signals.
+        `crossings`: free way before each bumper to a crossing in use [m].
         """
         _, _, heading, speed = pose
         force, wheel = controls
@@ -231,6 +233,7 @@ class Fleet:
         front = self.s + LENGTH / 2 - self.move_start  # of the bumper, from the stop line; -inf without a light
         state = self._heed_lights(front, speed, force, lights)
         crossing = self._right_of_way(step, front, speed, state, lead_gap, lead)
+        lead_gap = np.minimum(lead_gap, crossings)
         gap = np.minimum(np.minimum(lead_gap, crossing), self._room_behind(step, front, speed, state))
         kmh = speed * 3.6
         limit = self.limits[self.strip] * 3.6

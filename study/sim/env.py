@@ -20,6 +20,7 @@ from study.sim.autopilot import MOST_STEERING, REACH, Decisions, Fleet
 from study.sim.dynamics import BRAKE, DT, LOOK, THROTTLE, TOP_SPEED, check_dynamics, follow_command
 from study.sim.geometry import LENGTH, Floats, Pose
 from study.sim.lights import LightPlan, plan_lights
+from study.sim.pedestrians import Pedestrians, lay_walks
 from study.sim.road import TownNetwork, TownRoad, TownVehicle
 from study.sim.town import Town, draw_town
 
@@ -44,10 +45,14 @@ class Traffic(TownRoad):
         *,
         fast: bool,
         lights: LightPlan,
+        pedestrians: Pedestrians | None = None,
     ) -> None:
         super().__init__(network=TownNetwork(town, fast=fast), np_random=rng)
         self.town, self.lights = town, lights
-        self.dynamics = dynamics
+        self.dynamics, self.pedestrians = dynamics, pedestrians
+        count = len(pedestrians) if pedestrians else 0
+        self.walkers = range(settings.vehicles, settings.vehicles + count)  # the pedestrians' numbers as agents
+        self.hits: list[tuple[int, int]] = []  # vehicles and the pedestrians whom they hit in the last step
         self.fleet = Fleet(town, settings.vehicles, settings.brake_hold, dynamics, rng)
         self.force, self.wheel = np.zeros((2, settings.vehicles))  # as they act [m/s2, rad]
         self.steps = 0
@@ -90,7 +95,7 @@ class Traffic(TownRoad):
         self.force[slot] = self.wheel[slot] = 0.0
         if slot < len(self.vehicles):
             self.vehicles[slot] = vehicle
-            self.agents[slot] = max(self.agents) + 1
+            self.agents[slot] = max(*self.agents, self.walkers.stop - 1) + 1
         else:
             self.vehicles.append(vehicle)
             self.agents.append(slot)
@@ -104,8 +109,10 @@ class Traffic(TownRoad):
         if self.decided < self.steps:
             pose = self.decided_pose = self.pose()
             self.light_states = self.lights.states(self.time)
+            crossings = self.pedestrians.gaps(self.fleet) if self.pedestrians else np.inf
+            pairs = self.pairs_within(REACH, pose)
             self.decisions = self.fleet.decide(
-                self.steps, pose, (self.force, self.wheel), self.pairs_within(REACH, pose), self.light_states
+                self.steps, pose, (self.force, self.wheel), pairs, self.light_states, crossings
             )
             self.decided = self.steps
         return self.decisions
@@ -138,12 +145,19 @@ class Traffic(TownRoad):
         self.steps += 1
         # highway-env marks vehicles that will overlap after one more step; they count as crashed now
         self.crashed = self.struck if self.fast else self.find_struck(range(len(self.vehicles)))
+        if self.pedestrians:
+            self.pedestrians.walk()
+            self.hits = self.pedestrians.hits(self.pose())
+            self.crashed = sorted({*self.crashed, *(slot for slot, _ in self.hits)})
         self.collided += len(self.crashed)
         if self.crashed:
             self.crash_pose = self.pose()
         for slot in self.crashed:
             self._enter(slot)
-        self._follow(self.moved if self.fast and not self.crashed else self.pose())
+        pose = self.moved if self.fast and not self.crashed else self.pose()
+        self._follow(pose)
+        if self.pedestrians:
+            self.pedestrians.set_off(self.time, self.fleet, pose[3], self.force)
 
 
 class TownAction(ActionType):
@@ -290,4 +304,8 @@ def make_traffic(
             f"town: {settings.vehicles} vehicles do not fit on {room:.0f} m of lanes with {2 * APART:g} m for each; "
             f"take at most {int(room / APART / 2)} (vehicles) or a larger grid"
         )
-    return Traffic(town, settings, dynamics, traffic_rng, fast=fast, lights=plan_lights(town, settings, light_rng))
+    lights = plan_lights(town, settings, light_rng)
+    walkers = None
+    if settings.pedestrians:
+        walkers = Pedestrians(lay_walks(town), settings.pedestrians, lights, rng(seed, "pedestrians"))
+    return Traffic(town, settings, dynamics, traffic_rng, fast=fast, lights=lights, pedestrians=walkers)

@@ -32,6 +32,11 @@ class LightPlan:
             np.uint8
         )
 
+    def until_green(self, time: float) -> NDArray[np.float64]:
+        """Return for how long every light stays red at `time` [s]: [L] s, 0 where it is not."""
+        since = np.mod(time - self.start + 1e-6, self.cycle)
+        return np.where(since < self.green + self.yellow, 0.0, self.cycle - since)
+
 
 def plan_lights(town: Town, settings: TownSettings, rng: np.random.Generator) -> LightPlan:
     """Return the plan of a town's lights: each junction starts its cycle at its own moment, drawn from `rng`."""

@@ -14,11 +14,12 @@ from filelock import FileLock
 from study.config.keys import FORMAT_VERSIONS, drive_name
 from study.config.settings import DynamicsSettings, RecordingSettings, TownSettings
 from study.episode.files import write_episode
-from study.episode.schema import Agent, Episode, Lane, Light, empty_states
+from study.episode.schema import PEDESTRIAN, Agent, Episode, Lane, Light, empty_states
 from study.errors import BadInputError
 from study.sim.dynamics import DT
 from study.sim.env import TownEnv, Traffic
-from study.sim.geometry import LANE_WIDTH, LENGTH, WIDTH, Floats
+from study.sim.geometry import LANE_WIDTH, LENGTH, WIDTH, Floats, Ints
+from study.sim.pedestrians import SIZE
 from study.sim.town import Town
 from study.stages import RECORD, Batch, Flow, Task
 
@@ -72,7 +73,7 @@ class Recorder:
     def __init__(self, road: Traffic, steps: int) -> None:
         self.road = road
         self.standing = np.zeros(len(road.vehicles))  # for how long [s]
-        self.arrays = empty_states(steps, max(road.agents) + SPARE)
+        self.arrays = empty_states(steps, max(*road.agents, road.walkers.stop) + SPARE)
         self.light_state = np.zeros((steps, len(road.town.signals)), np.uint8)
         self.step = 0  # the next one, or the one between `before` and `after`
         self.seen: list[dict[str, Any]] = []  # of each step, as it was before rounding
@@ -99,11 +100,9 @@ class Recorder:
         self.seen.append(
             {"agent": self.agents, "speed": speed, "standing": self.standing, "route_s": decisions.route_s}
         )
-        self._write("present", values=True)
-        self._write("x", x)
-        self._write("y", -y)
-        self._write("heading", np.mod(-heading + np.pi, 2 * np.pi) - np.pi)
-        self._write("speed", np.maximum(speed, 0))
+        self._write_pose(self.agents, x, y, heading, speed)
+        if self.road.pedestrians:
+            self._write_pose(np.array(self.road.walkers), *self.road.pedestrians.pose())
         self._write("light", decisions.light)
         self._write("light_distance", decisions.light_distance)
         self._write("route_s", decisions.route_s)
@@ -128,6 +127,11 @@ class Recorder:
                 wider[key][:, :columns] = old
             self.arrays = wider
 
+    def _write_pose(self, agents: Ints, x: Floats, y: Floats, heading: Floats, speed: Floats) -> None:
+        values = {"x": x, "y": -y, "heading": np.mod(-heading + np.pi, 2 * np.pi) - np.pi}
+        for name, value in {"present": True, "speed": np.maximum(speed, 0), **values}.items():
+            self.arrays[name][self.step, agents] = value
+
     def _write(self, name: str, values: Any) -> None:
         self.arrays[name][self.step, self.agents] = values
 
@@ -146,7 +150,8 @@ class Recorder:
         numbers, s = (np.array([row[name] for row in self.seen[: self.step]]) for name in ("agent", "route_s"))
         present, columns = np.unique(numbers, return_inverse=True)
         agents = present.tolist()
-        arrays = {key: values[: self.step, agents] for key, values in self.arrays.items()}
+        everyone = [*agents, *self.road.walkers]
+        arrays = {key: values[: self.step, everyone] for key, values in self.arrays.items()}
         routes, shifts = self._routes(agents, columns, s)
         arrays["route_s"][np.arange(self.step)[:, None], columns] = s - shifts[columns]
         lanes, lights = town_map(self.road.town)
@@ -155,13 +160,18 @@ class Recorder:
             source=source,
             rate_hz=1 / DT,
             labels="recorded",
-            agents=tuple(Agent(agent, LENGTH, WIDTH) for agent in agents),
+            agents=tuple(self.agent(number) for number in everyone),
             lanes=lanes,
             lights=lights,
             light_state=self.light_state[: self.step].copy(),
-            routes=routes,
+            routes=(*routes, *[np.empty((0, 2), np.float32)] * len(self.road.walkers)),
             **arrays,
         )
+
+    def agent(self, number: int) -> Agent:
+        """Return the agent with this number."""
+        walks = number in self.road.walkers
+        return Agent(number, SIZE, SIZE, kind=PEDESTRIAN) if walks else Agent(number, LENGTH, WIDTH)
 
     def _routes(
         self, agents: list[int], columns: np.ndarray[Any, Any], s: Floats
