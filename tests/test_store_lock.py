@@ -1,14 +1,12 @@
 """One sweep at a time writes to a database, whatever folder it works in and however it names the file."""
 
 import os
-from dataclasses import replace
 
 import pytest
 
-from study.config.workspace import Workspace
+from study.config.workspace import HERE, Workspace
 from study.errors import BadInputError
-from study.sweep.run import hold_store
-from tests.support.plans import plan_of
+from study.sweep.locks import hold_store
 
 
 @pytest.mark.parametrize("name", ["the same", "a link to the file", "a link to its folder", "relative", "with options"])
@@ -26,9 +24,8 @@ def test_two_working_folders_on_one_database_hold_one_lock(name, tmp_path):
         "relative": f"sqlite:///{os.path.relpath(store)}/mlflow.db",
         "with options": f"{uri}?timeout=60",
     }
-    plan = plan_of(["heads"])
-    elsewhere = replace(plan, workspace=Workspace(data=tmp_path / "data", mlruns=tmp_path / "mlruns"))
-    with hold_store(plan, uri, wait=False):
+    elsewhere = Workspace(data=tmp_path / "data", mlruns=tmp_path / "mlruns")
+    with hold_store(HERE, uri, "sweep, heads", wait=False):
         refused = pytest.raises(BadInputError, match=rf"another sweep, heads \(process {os.getpid()}\), runs on this")
-        with refused, hold_store(elsewhere, names[name], wait=False):
+        with refused, hold_store(elsewhere, names[name], "clean", wait=False):
             pass

@@ -12,24 +12,36 @@ import torch
 from study.compute.provenance import cpu_lines
 from study.errors import BadInputError, one_of
 
+APPLE = "Apple GPU"
+
 
 def check_device(name: str) -> torch.device:
     """Return the torch device of that name. Raises BadInputError when this machine lacks it."""
     try:
         device = torch.device(name)
     except RuntimeError as error:
-        raise one_of("device", name, ("cpu", "cuda", "cuda:0", "...")) from error
+        raise one_of("device", name, ("cpu", "cuda", "cuda:0", "...", "mps")) from error
     if device.type == "cpu":
         return torch.device("cpu")
+    apple = torch.backends.mps.is_available()
+    if device.type == "mps" and apple and not device.index:
+        return torch.device("mps")
     count = torch.cuda.device_count()
     if device.type != "cuda" or (device.index or 0) >= count:
-        names = ["cpu", *(f"cuda:{index}" for index in range(count))]
+        names = ["cpu", *(f"cuda:{index}" for index in range(count)), *["mps"] * apple]
         raise BadInputError(f"device '{name}' is not on this machine; choose from {', '.join(names)}")
     return torch.device("cuda", device.index or 0)
 
 
 def choose_precision(setting: Literal["auto", "fp32", "bf16"], device: torch.device) -> Literal["fp32", "bf16"]:
-    """Return the precision of training; "auto" is bf16 where the hardware multiplies bf16 matrices itself."""
+    """Return the precision of training; "auto" is bf16 where the hardware multiplies bf16 matrices itself.
+
+    Raises BadInputError for bf16 on an Apple GPU.
+    """
+    if device.type == "mps":
+        if setting == "bf16":
+            raise BadInputError("encoder.precision bf16 is not there on device 'mps'; choose from auto, fp32")
+        return "fp32"
     if setting != "auto":
         return setting
     if device.type == "cuda":
@@ -61,6 +73,8 @@ def choose_device(name: str) -> str:
 
 def device_name(device: str) -> str:
     """Return the device's name for readers."""
+    if device == "mps":
+        return APPLE
     return torch.cuda.get_device_name(device) if device.startswith("cuda") else "CPU"
 
 

@@ -28,7 +28,7 @@ def trainer(device: torch.device, epochs: int, load: str, remedy: str, **options
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", module="lightning.*")  # devices, workers and its own products
             yield lightning.Trainer(
-                accelerator="gpu" if device.type == "cuda" else "cpu",
+                accelerator="gpu" if device.type == "cuda" else device.type,
                 devices=1 if device.index is None else [device.index],
                 max_epochs=epochs,
                 plugins=[LightningEnvironment()],  # one process, also inside a Slurm job

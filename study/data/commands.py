@@ -14,6 +14,7 @@ from study.config.workspace import Workspace
 from study.console.display import Display
 from study.data.card import source_drives, write_card
 from study.data.frames import open_frames
+from study.data.in_use import shared_use
 from study.data.prepare import data_flow, drives_flow, drives_folder
 from study.data.preview import write_preview
 from study.engine.flows import run_flow
@@ -80,7 +81,7 @@ def convert(name: str, sources: Sequence[Path], out: Path, cut: float, **options
 
 
 def _run(flow: Flow[Any], title: str, seconds: float, workers: int, workspace: Workspace) -> Any:
-    with Display(title, {}, {}, seconds) as display:
+    with shared_use(workspace.data), Display(title, {}, {}, seconds) as display:
         if workers == 1:
             return run_flow(flow, progress=display.data)
         with local_engine(workers, workspace.tmp) as engine:

@@ -136,8 +136,8 @@ class MultiHeadAutoencoder(lightning.LightningModule):
         return torch.optim.Adam(self.parameters(), lr=self.settings.lr, fused=True)
 
     def _note(self, split: Split, losses: Tensor, count: int) -> None:
-        weighted = torch.cat([losses, losses.new_ones(1)]).double() * count
-        self.sums[split] = self.sums[split].to(losses.device, non_blocking=True) + weighted
+        weighted = torch.cat([losses, losses.new_ones(1)]).to(_accurate(losses.device)) * count
+        self.sums[split] = self.sums[split].to(weighted.dtype).to(losses.device, non_blocking=True) + weighted
         self.totals[split].append(losses[0])
 
     def reset_means(self) -> None:
@@ -148,7 +148,7 @@ class MultiHeadAutoencoder(lightning.LightningModule):
     def means(self) -> dict[str, float]:
         """Return the mean of each loss since the last reset, e.g. "train/loss_rec"; waits for the device."""
         means: dict[str, float] = {}
-        rows = torch.stack([sums.to(self.device) for sums in self.sums.values()]).tolist()
+        rows = torch.stack([sums.to(_accurate(self.device)).to(self.device) for sums in self.sums.values()]).tolist()
         for split, (*values, count) in zip(self.sums, rows, strict=True):
             means |= {f"{split}/{name}": value / count for name, value in zip(self.metrics, values, strict=True)}
         return means
@@ -156,6 +156,11 @@ class MultiHeadAutoencoder(lightning.LightningModule):
     def not_finite(self, split: Split) -> int:
         """Return the position, since the last reset, of the first batch whose loss was not finite; there is one."""
         return int(torch.stack(self.totals[split]).isfinite().int().argmin())
+
+
+def _accurate(device: torch.device) -> torch.dtype:
+    """Return the type of sums over an epoch: float64, which Apple's GPUs lack."""
+    return torch.float32 if device.type == "mps" else torch.float64
 
 
 def _numbers(head: str, settings: EncoderSettings) -> int:

@@ -62,7 +62,7 @@ def prefetched(arrays: Arrays, parts: Sequence[Indices], device: torch.device) -
         gathered = torch.empty((len(rows), *source.shape[1:]), dtype=source.dtype, pin_memory=gpu)
         torch.index_select(source, 0, rows, out=gathered)
         with torch.cuda.stream(stream):
-            return gathered.to(device, non_blocking=True)
+            return gathered.to(device, non_blocking=gpu)  # memory that is not pinned may be gone too early
 
     def fetch(part: Indices) -> tuple[tuple[Tensor, Tensor], torch.cuda.Event | None]:
         rows = torch.from_numpy(part)

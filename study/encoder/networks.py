@@ -28,7 +28,7 @@ class _Convolution(nn.Conv2d):
 
     def forward(self, input: Tensor) -> Tensor:  # noqa: A002 - torch's name
         assert self.bias is not None
-        if input.device.type == "cpu" or self.in_channels >= CHANNEL_BLOCK:
+        if input.device.type != "cuda" or self.in_channels >= CHANNEL_BLOCK:
             return functional.conv2d(input, self.weight, self.bias.detach(), self.stride)
         return convolve_blocks(input, self.weight, self.bias.detach())
 
@@ -105,7 +105,7 @@ def _transposed(layer: nn.ConvTranspose2d, images: Tensor, bias: Tensor) -> Tens
             images, layer.weight.to(images.dtype), bias.to(images.dtype), extra
         )
         return output
-    if layer.out_channels < CHANNEL_BLOCK and not extra:
+    if images.device.type == "cuda" and layer.out_channels < CHANNEL_BLOCK and not extra:
         return interleave_blocks(images, layer.weight, layer.out_channels) + bias.view(-1, 1, 1)
     return functional.conv_transpose2d(images, layer.weight, bias, STRIDE, output_padding=extra)
 

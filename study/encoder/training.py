@@ -135,7 +135,7 @@ def train_encoder(
     if epochs:
         if target.type == "cpu":
             keep_memory()
-        else:
+        elif target.type == "cuda":
             module.to(memory_format=torch.channels_last)
             if epochs * plan.frames_an_epoch >= FUSED_IMAGES:
                 module.fuse()

@@ -7,7 +7,7 @@ knows what is done, so trials that an earlier process left open are closed at th
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import optuna
@@ -30,7 +30,7 @@ class Trials:
         self._names = {key: f"{label} {key}" for key, label in labels.items()}
         self._running: dict[str, Trial] = {}
         self._queued = list(order)
-        with self._guard():
+        with _guard(self._file):
             file.parent.mkdir(parents=True, exist_ok=True)
             self._study = optuna.create_study(
                 study_name=study, storage=f"sqlite:///{file}", direction="maximize", load_if_exists=True
@@ -50,7 +50,7 @@ class Trials:
         """Return the key of the cell to run next, or None when there is none."""
         if not self._queued:
             return None  # Optuna would invent one
-        with self._guard():
+        with _guard(self._file):
             trial = self._study.ask()
             name = trial.suggest_categorical(PARAMETER, list(self._names.values()))
         key = next(key for key in self._queued if self._names[key] == name)
@@ -60,28 +60,37 @@ class Trials:
 
     def finish(self, key: str, score: float) -> None:
         """Record that a cell is finished, with a score for Optuna's dashboard."""
-        with self._guard():
+        with _guard(self._file):
             self._study.tell(self._running.pop(key), score)
 
     def fail(self, key: str, reason: str) -> None:
         """Record that a cell has failed."""
-        with self._guard():
+        with _guard(self._file):
             trial = self._running.pop(key)
             trial.set_user_attr("reason", masked(reason)[:2000])
             self._study.tell(trial, state=TrialState.FAIL)
 
     def stop(self) -> None:
         """Close the trials that are open: the sweep was stopped."""
-        with self._guard():
+        with _guard(self._file):
             self._close_open()
 
-    @contextmanager
-    def _guard(self) -> Iterator[None]:
-        try:
-            yield
-        except (StorageInternalError, SQLAlchemyError, OSError) as error:
-            reason = " ".join(str(error.__cause__ or error).partition("\n[SQL")[0].split())[:300]
-            raise BadInputError(
-                f"{self._file}, where Optuna keeps the order of the cells, cannot be used: {reason}; make room, or "
-                "move the file away (it holds no results)"
-            ) from None
+
+@contextmanager
+def _guard(file: Path) -> Iterator[None]:
+    try:
+        yield
+    except (StorageInternalError, SQLAlchemyError, OSError) as error:
+        reason = " ".join(str(error.__cause__ or error).partition("\n[SQL")[0].split())[:300]
+        raise BadInputError(
+            f"{file}, where Optuna keeps the order of the cells, cannot be used: {reason}; make room, or "
+            "move the file away (it holds no results)"
+        ) from None
+
+
+def forget(file: Path, studies: Iterable[str]) -> None:
+    """Delete studies from Optuna's file, where they are in it."""
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    for name in studies if file.is_file() else ():
+        with _guard(file), suppress(KeyError):
+            optuna.delete_study(study_name=name, storage=f"sqlite:///{file}")

@@ -35,6 +35,7 @@ Further commands, each with its own --help:
   drive NAME       watch a finished cell, or your own function, drive
   train NAME       train where there is no tracker; results become folders
   import NAME DIR  commit the results of train to MLflow
+  clean [NAME...]  list sweeps and cached data with their sizes; delete chosen ones
 
 In brackets: the value where the profile names no other.
 Example: python -m study.sweep heads --profile smoke --heads '[rec, full]' --encoder.epochs 50""",
@@ -148,7 +149,40 @@ def drive(command: str, /, *, plan: Plan, tracking: str, out: Path | None, **cho
     return stoppable(lambda: int(module.drive(plan, tracking, chosen, out)), command)
 
 
-COMMANDS = {"status": status, "verify": verify, "drive": drive, "train": train, "import": import_results}
+@click.command
+@click.argument("names", metavar="[NAME...]", nargs=-1)
+@click.option("--profile", metavar="P", help="of the named sweeps, those of this profile [every profile]")
+@click.option(
+    "--older-than",
+    type=click.FloatRange(min=0),
+    metavar="DAYS",
+    help="of the named sweeps, or of all, those unused since",
+)
+@click.option("--unused", is_flag=True, help="all cached data that no remaining sweep uses, too")
+@click.option("--dry-run", "show_only", is_flag=True, help="show what would go, and how much room that makes")
+@click.option("--yes", is_flag=True, help="do not ask")
+@click.option("--wait", is_flag=True, help="wait while a sweep runs on this tracking store or in this data folder")
+@tracking_option()
+@click.pass_obj
+def clean(command: str, /, *, tracking: str, show_only: bool, yes: bool, wait: bool, **choice: Any) -> int:
+    """List all sweeps and cached data with age and size; with a choice, delete for good what no other sweep uses.
+
+    NAME is a sweep's name or the start of its run's id, as the list shows them. Reports stay.
+    """
+    module = resolve_name("study.sweep.clean")
+    chosen = module.Choice(**choice)
+    work = lambda: int(module.clean(chosen, tracking, show_only=show_only, yes=yes, wait=wait))  # noqa: E731
+    return stoppable(work, command)
+
+
+COMMANDS = {
+    "status": status,
+    "verify": verify,
+    "drive": drive,
+    "train": train,
+    "import": import_results,
+    "clean": clean,
+}
 
 
 def main(args: Sequence[str]) -> int:

@@ -7,13 +7,11 @@ import shutil
 import threading
 from collections.abc import Callable, Collection
 from contextlib import suppress
-from pathlib import Path
 from typing import Any, ParamSpec, Self, TypeVar
 
 from tenacity import RetryCallState, Retrying, retry_if_exception_type, stop_after_delay, wait_fixed
 
 from study.cell.flow import cell_flow, product_folders
-from study.config.workspace import Workspace
 from study.console.display import Display
 from study.console.interrupts import check_stopped
 from study.engine.flows import Listener
@@ -23,10 +21,11 @@ from study.engine.trials import Trials
 from study.errors import BadInputError, masked
 from study.results.cell_result import CellResult
 from study.stages import Flow
+from study.sweep.locks import store_folder
 from study.sweep.options import RunOptions
 from study.sweep.plan import Plan, cell_jobs
 from study.tracking.cell_run import CellRun
-from study.tracking.experiment import DeletedError, TrackerLostError, database_file
+from study.tracking.experiment import DeletedError, TrackerLostError
 from study.tracking.tracker import Tracker
 
 PATIENCE, RETRY = 600.0, 3.0  # [s] a lost server is waited for, and between two tries
@@ -197,9 +196,3 @@ def _score(result: CellResult) -> float:
     curves = result.curves
     final = curves[(curves["metric"] == SCORE) & (curves["split"] == "test")]
     return float(final[final["epoch"] == final["epoch"].max()]["value"].mean())
-
-
-def store_folder(workspace: Workspace, tracking: str) -> Path:
-    """Return where the lock and Optuna's file of a tracking store lie: beside a database file, else in mlruns/."""
-    database = database_file(tracking)
-    return database.parent if database else workspace.mlruns

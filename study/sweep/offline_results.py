@@ -12,15 +12,16 @@ from study.compute.provenance import provenance
 from study.driving.driver import export_driver
 from study.errors import BadInputError
 from study.results.cell_result import CellResult, load_results
+from study.sweep.locks import hold_store
 from study.sweep.plan import Plan
-from study.sweep.run import hold_store, open_sweep, write_report
+from study.sweep.run import open_sweep, write_report
 from study.tracking.tracker import Tracker
 
 
 def import_folder(plan: Plan, folder: Path, tracking: str, *, wait: bool, report: bool) -> int:
     """Commit what was trained elsewhere, then write the report or name the missing cells; returns the exit code."""
     keys = planned_results(plan, folder)
-    with hold_store(plan, tracking, wait=wait):
+    with hold_store(plan.workspace, tracking, f"sweep, {plan.grid.name}", wait=wait):
         tracker = Tracker(tracking)
         missing = take_in(plan, folder, keys, tracker)
         for key in missing:

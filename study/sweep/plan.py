@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import pkgutil
 import shlex
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -84,14 +84,14 @@ class Plan:
         return {key: Work(self.settings, cell, self.grid.policy_seeds) for key, cell in self.cells.items()}
 
     @property
-    def key(self) -> str:
-        """Return the key of the plan: the same cells under the same name."""
-        return content_key("plan", {"sweep": self.grid.name, "profile": self.profile}, tuple(self.cells), 1)
-
-    @property
     def study_name(self) -> str:
         """Return the name of the plan's Optuna study."""
-        return f"{self.grid.name} {self.profile} {self.key}"
+        return study_name(self.grid.name, self.profile, self.cells)
+
+
+def study_name(sweep: str, profile: str, cells: Iterable[str]) -> str:
+    """Return the name of the Optuna study of a plan: the same cells under the same name."""
+    return f"{sweep} {profile} {content_key('plan', {'sweep': sweep, 'profile': profile}, tuple(cells), 1)}"
 
 
 def make_plan(

@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-import json
-import os
-import shutil
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
-
-from filelock import FileLock, Timeout
 
 from study.atomic import scratch_folder
 from study.compute.gpus import visible_gpus
 from study.compute.provenance import cores, provenance, warn_of_unknown_origin
-from study.config.workspace import Workspace
 from study.data.card import card_files, source_drives
 from study.data.frames import open_frames
 from study.data.prepare import data_flow, describe_data
@@ -27,11 +20,12 @@ from study.engine.flows import run_flow, run_flows
 from study.engine.inline import InlineEngine
 from study.engine.local import local_engine
 from study.engine.tasks import Engine
-from study.errors import EXIT_FAILED, BadInputError, masked
+from study.errors import EXIT_FAILED
 from study.report.build import publish
 from study.stages import DESCRIBE, Batch, Flow, Task
-from study.sweep.committing import Committing, store_folder
+from study.sweep.committing import Committing
 from study.sweep.driving import drive_cells, undriven
+from study.sweep.locks import hold_store, temporary_folder
 from study.sweep.options import RunOptions
 from study.sweep.plan import Plan, plan_display
 from study.tracking.tracker import Tracker
@@ -41,7 +35,7 @@ def execute(plan: Plan, options: RunOptions, command: str, *, report: bool) -> i
     """Run what is not finished, then write the report unless told not to. Returns the exit code."""
     origin = provenance()
     warn_of_unknown_origin(origin)
-    with hold_store(plan, options.tracking, wait=options.wait):
+    with hold_store(plan.workspace, options.tracking, f"sweep, {plan.grid.name}", wait=options.wait):
         tracker = Tracker(options.tracking)
         failed, code = run_cells(plan, options, tracker, origin), 0
         try:
@@ -126,31 +120,6 @@ def start_engine(plan: Plan, options: RunOptions) -> DaskEngine:
     return local_engine(workers, scratch, visible_gpus(options.device))
 
 
-@contextmanager
-def temporary_folder(workspace: Workspace) -> Iterator[None]:
-    """Have this process put its temporary files into the workspace, where the next sweep removes what a kill leaves."""
-    folder = workspace.tmp
-    folder.mkdir(parents=True, exist_ok=True)
-    before = tempfile.tempdir
-    lock = FileLock(workspace.data / ".in-use")
-    with suppress(Timeout):  # another sweep works here, and may need what it has there
-        lock.acquire(blocking=False)
-        _empty(folder)
-    tempfile.tempdir = str(folder.absolute())
-    try:
-        yield
-    finally:
-        tempfile.tempdir = before
-    if lock.is_locked:
-        _empty(folder)
-        lock.release()
-
-
-def _empty(folder: Path) -> None:
-    for path in folder.iterdir():
-        shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
-
-
 def _data_flow(plan: Plan, engine: Engine) -> Flow[Any]:
     """Make and describe the frames: here, with the engine's help, unless its workers have folders of their own."""
     if _shares_folder(plan.workspace.data, engine):
@@ -171,33 +140,3 @@ def _describe_here(plan: Plan) -> tuple[dict[str, Any], dict[str, bytes]]:
     store = open_frames(plan.frames)
     files = card_files(store, source_drives(store, plan.drives), plan.frames)
     return store.manifest, {path.name: path.read_bytes() for path in files}
-
-
-@contextmanager
-def hold_store(plan: Plan, tracking: str, *, wait: bool) -> Iterator[None]:
-    """Hold a tracking store for one sweep at a time.
-
-    Raises BadInputError that says who holds it, unless told to `wait`.
-    """
-    folder = store_folder(plan.workspace, tracking)
-    folder.mkdir(parents=True, exist_ok=True)
-    lock, holder = FileLock(folder / "sweep.lock"), folder / "sweep.json"
-    try:
-        lock.acquire(blocking=False)
-    except Timeout:
-        who = "another sweep"
-        with suppress(OSError, ValueError, KeyError):  # it has not written its name yet
-            other = json.loads(holder.read_text(encoding="utf-8"))
-            who = f"another sweep, {other['sweep']} (process {other['process']}),"
-        if not wait:
-            raise BadInputError(
-                f"{who} runs on this store ({masked(tracking)}); wait for it, or give --wait to start when it ends"
-            ) from None
-        print(f"waiting for {who}, which runs on this store", file=sys.stderr)
-        lock.acquire()
-    try:
-        holder.write_text(json.dumps({"sweep": plan.grid.name, "process": os.getpid()}), encoding="utf-8")
-        yield
-    finally:
-        holder.unlink(missing_ok=True)
-        lock.release()

@@ -24,6 +24,7 @@ from study.cell.job import CellJob
 from study.compute.gpus import visible_gpus
 from study.compute.provenance import cores, provenance, warn_of_unknown_origin
 from study.console.display import Display
+from study.data.in_use import shared_use
 from study.data.prepare import data_flow
 from study.engine.flows import Listener, run_flow, run_flows
 from study.engine.inline import InlineEngine
@@ -47,9 +48,9 @@ def train(plan: Plan, out: Path, device: str, threads: int) -> int:
     if not jobs:
         return 0
     warn_of_unknown_origin(provenance())
-    plan.workspace.data.mkdir(exist_ok=True)
     gpus = visible_gpus(device)
-    with plan_display(plan, jobs) as display, _engine(plan, gpus, threads) as engine:
+    using = shared_use(plan.workspace.data)
+    with using, plan_display(plan, jobs) as display, _engine(plan, gpus, threads) as engine:
         run_flow(data_flow(plan.settings, plan.workspace.data, plan.imported), engine, display.data)
         shutil.copyfile(plan.frames / "manifest.json", out / f"frames-{plan.frames.name}.json")
         saving = _Saving(out, jobs, display, one_share=bool(gpus))

@@ -28,6 +28,7 @@ from study.config.grid import Cell
 from study.config.keys import cell_key
 from study.config.settings import StudySettings
 from study.console.display import Display
+from study.data.in_use import shared_use
 from study.data.prepare import data_flow
 from study.engine.flows import run_flow
 from study.engine.local import local_engine
@@ -189,8 +190,7 @@ def verify(plan: Plan, tracking: str, wanted: str | None, seed: int, workers: in
     key = choose({key: plan.cells[key] for key in runs}, wanted, seed)
     print(f"{plan.cells[key].label} ({key})" + ("" if wanted else f", drawn with --seed {seed}"))
     recorded = reader.load_result(runs[key])
-    plan.workspace.data.mkdir(exist_ok=True)
-    with plan_display(plan, [key]) as display:
+    with shared_use(plan.workspace.data), plan_display(plan, [key]) as display:
         again = compute_again(plan, recorded, display, workers)
     return report(recorded, again, plan.grid.rules.allowance([recorded.cell.heads] * 2))
 

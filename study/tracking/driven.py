@@ -16,8 +16,8 @@ from mlflow.entities import Metric, RunTag
 from study.atomic import scratch_folder
 from study.results.drives import PLACES, means
 from study.tracking.metrics import bands
-from study.tracking.reader import DRIVE_KEY, DRIVES
-from study.tracking.tracker import PARENT, Tracker
+from study.tracking.reader import DRIVE_KEY, DRIVES, PARENT
+from study.tracking.tracker import Tracker
 
 
 def commit_drives(tracker: Tracker, run_id: str, key: str, table: pd.DataFrame, films: Mapping[str, bytes]) -> None:

@@ -20,7 +20,7 @@ from typing import Any
 
 from filelock import FileLock
 from mlflow.entities import Experiment as MlflowExperiment
-from mlflow.entities import Run
+from mlflow.entities import Run, ViewType
 from mlflow.exceptions import MlflowException
 from mlflow.tracking import MlflowClient
 from sqlalchemy.exc import SQLAlchemyError  # MLflow depends on sqlalchemy and lets its errors through
@@ -76,12 +76,12 @@ class Experiment:
         """Turn errors of the store into TrackerLostError."""
         return guard(self.uri)
 
-    def search(self, query: str) -> list[Run]:
-        """Return all runs that match, in the order of their start."""
+    def search(self, query: str, view: int = ViewType.ACTIVE_ONLY) -> list[Run]:
+        """Return all runs that match, in the order of their start; deleted ones only with another `view`."""
         runs: list[Run] = []
         token = None
         while True:
-            page = self.client.search_runs([self.id], query, max_results=1000, page_token=token)
+            page = self.client.search_runs([self.id], query, view, max_results=1000, page_token=token)
             runs += page
             token = page.token
             if not token:
@@ -237,7 +237,8 @@ def check_place(uri: str, name: str, location: str | None) -> None:
     `location`: where the experiment of that name has its artifacts; None: it is to be made.
     """
     host = None if uri.startswith((SQLITE, "http")) else _other_host(uri)
-    if host is None or (location and (_is_remote(location) or _folder(location).is_dir())):
+    folder = local_folder(location) if location else None
+    if host is None or (location and (folder is None or folder.is_dir())):
         return
     shown = masked(uri)
     place = (
@@ -252,12 +253,10 @@ def check_place(uri: str, name: str, location: str | None) -> None:
     )
 
 
-def _is_remote(location: str) -> bool:
-    scheme = urllib.parse.urlsplit(location).scheme
-    return scheme not in {"", "file"}
-
-
-def _folder(location: str) -> Path:
+def local_folder(location: str) -> Path | None:
+    """Return the folder that a location of artifacts names, or None for one that is not on this machine's disks."""
+    if urllib.parse.urlsplit(location).scheme not in {"", "file"}:
+        return None
     return Path(urllib.request.url2pathname(location.removeprefix("file://")))
 
 

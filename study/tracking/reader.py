@@ -5,9 +5,12 @@ A cell is done when its run is FINISHED with its `cell_key`, whichever sweep has
 
 from __future__ import annotations
 
+import os
+import platform
+import time
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 from typing import Any, Self
 
 import pandas as pd
@@ -21,6 +24,7 @@ from study.config.workspace import HERE
 from study.errors import BadInputError, masked
 from study.results.cell_result import CellResult
 from study.results.sweep_record import SweepRecord
+from study.tracking.cell_run import ALIVE, HOST, PROCESS
 from study.tracking.experiment import Experiment, TrackerLostError, UnreadableError, find_experiment
 
 PLAN_VERSION = 1
@@ -28,6 +32,8 @@ RESULT = "result"  # artifact folder of a cell run
 DRIVES = PurePosixPath("drives/drives.parquet")  # artifact of a cell run whose policies have driven
 DRIVE_KEY = "drive_key"  # its tag, written last
 SWEEP_FILES = ("plan.json", "data.json", "provenance.json", "uncommitted.diff")  # artifacts of a sweep run
+PARENT = "mlflow.parentRunId"  # tag of a cell's run and of a seed's: the run above it
+LIVES = 600.0  # [s] around a sign of life from another machine, whose clock may differ by minutes
 PERMANENT = "permanent"  # tag of a failed attempt: another try would not help
 
 
@@ -132,6 +138,16 @@ class Reader:
         with self.experiment.guard():
             return sorted(self.experiment.search("tags.kind = 'sweep'"), key=opened_at)
 
+    def lives(self, sweep_run: Run) -> bool:
+        """Return whether the process that opened a sweep goes on, as far as that can be known."""
+        tags = sweep_run.data.tags
+        process = tags.get(PROCESS, "")
+        if tags.get(HOST) == platform.node():
+            return process.isdecimal() and process != str(os.getpid()) and Path(f"/proc/{process}").exists()
+        cells = self.experiment.search(running_cells(sweep_run.info.run_id))
+        heard = max((int(cell.data.tags.get(ALIVE, 0)) for cell in cells), default=0)
+        return abs(time.time() - heard / 1000) < LIVES
+
     def sweeps_of(self, name: str, profile: str | None = None) -> list[str]:
         """Return the run ids of the sweeps of that name, the latest first. Raises BadInputError when there is none."""
         runs = self.sweep_runs()
@@ -165,14 +181,14 @@ class Reader:
 
     def read_settings(self, sweep_run_id: str) -> StudySettings:
         """Return a sweep's settings. Raises BadInputError when another version of this program planned it."""
-        return self._read_plan(sweep_run_id)[2]
+        return self.read_plan(sweep_run_id)[2]
 
     def read_sweep_run(self, run_id: str) -> SweepRecord:
         """Return a sweep with its finished cells. Raises UnreadableError when its plan or its data cannot be read."""
         missing = self._missing(run_id)
         if missing and {"plan.json", "data.json"} & set(missing):
             raise UnreadableError(self._lacks(run_id, missing))
-        grid, profile, settings, planned = self._read_plan(run_id)
+        grid, profile, settings, planned = self.read_plan(run_id)
         data = self.experiment.read_json(run_id, "data.json")
         unread = [self._lacks(run_id, missing)] if missing else []
         provenance: dict[str, Any] = {}
@@ -226,7 +242,8 @@ class Reader:
     def _lacks(self, run_id: str, missing: Sequence[str]) -> str:
         return f"{', '.join(missing)} of run {run_id} in {self.experiment.uri} cannot be read: no such artifact"
 
-    def _read_plan(self, run_id: str) -> tuple[Grid, str, StudySettings, dict[str, Cell]]:
+    def read_plan(self, run_id: str) -> tuple[Grid, str, StudySettings, dict[str, Cell]]:
+        """Return a sweep's grid, profile, settings and cells by key. Raises as `read_settings` and `download`."""
         plan = self.experiment.read_json(run_id, "plan.json")
         try:
             if plan.get("format_version") != PLAN_VERSION:
@@ -239,6 +256,11 @@ class Reader:
                 f"sweep run {run_id} in {self.experiment.uri} was planned by another version of this program "
                 f"({error}); run the sweep again"
             ) from error
+
+
+def running_cells(sweep_run_id: str) -> str:
+    """Return the query for the attempts of a sweep that are RUNNING."""
+    return f"tags.kind = 'cell' and attributes.status = 'RUNNING' and tags.`{PARENT}` = '{sweep_run_id}'"
 
 
 def reason_of(tags: Mapping[str, str]) -> str:

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from mlflow.entities import Dataset, DatasetInput, InputTag, Metric, Param, Run, RunTag
+from mlflow.entities import Dataset, DatasetInput, InputTag, Metric, Param, RunTag
 
 from study.atomic import scratch_folder
 from study.config.grid import Cell, Grid
@@ -36,12 +36,19 @@ from study.tracking.cell_run import ALIVE, HOST, PROCESS, CellRun, Status
 from study.tracking.experiment import DeletedError, TrackerLostError, UnreadableError, few_tries, open_experiment
 from study.tracking.metrics import COMMIT, bands, cell_points, describe_facts, final_scores, flatten, known, points
 from study.tracking.model import log_model
-from study.tracking.reader import PERMANENT, PLAN_VERSION, RESULT, Reader, in_order_of_end, opened_at
+from study.tracking.reader import (
+    PARENT,
+    PERMANENT,
+    PLAN_VERSION,
+    RESULT,
+    Reader,
+    in_order_of_end,
+    opened_at,
+    running_cells,
+)
 from study.tracking.run_page import NOTE, cell_tags
 
 VALUE_LIMIT = 4000  # characters of a parameter or tag; MLflow takes 6000 and 8000, its databases 8000
-PARENT = "mlflow.parentRunId"
-LIVES = 600.0  # [s] around a sign of life from another machine, whose clock may differ by minutes
 
 
 class Tracker:
@@ -102,7 +109,7 @@ class Tracker:
             for run in sweeps:
                 # One sweep at a time opens a database file: the others were killed, unless they go through a server.
                 running = run.info.status == "RUNNING" and run.info.run_id != run_id
-                if self.experiment.is_file and running and not self._lives(run):
+                if self.experiment.is_file and running and not self.reader.lives(run):
                     self._close_cells(run.info.run_id)
                     self._close_run(run.info.run_id, "KILLED", {"reason": "another sweep was started"})
             params = _params({**flatten(plan["grid"]), "profile": profile, **flatten(plan["settings"])})
@@ -116,16 +123,6 @@ class Tracker:
             self.client.log_dict(run_id, facts, "provenance.json")
             self.client.log_text(run_id, str(provenance.get("diff") or ""), "uncommitted.diff")
         return run_id
-
-    def _lives(self, sweep_run: Run) -> bool:
-        """Return whether the process that opened a sweep goes on, as far as that can be known."""
-        tags = sweep_run.data.tags
-        process = tags.get(PROCESS, "")
-        if tags.get(HOST) == platform.node():
-            return process.isdecimal() and process != str(os.getpid()) and Path(f"/proc/{process}").exists()
-        cells = self.experiment.search(_running_cells(sweep_run.info.run_id))
-        heard = max((int(cell.data.tags.get(ALIVE, 0)) for cell in cells), default=0)
-        return abs(time.time() - heard / 1000) < LIVES
 
     def _describe_reused(self, planned: Mapping[str, Cell], name: str) -> str:
         """Return the planned cells that another sweep has finished, in words."""
@@ -144,7 +141,7 @@ class Tracker:
             self.client.set_terminated(sweep_run_id, status)
 
     def _close_cells(self, sweep_run_id: str) -> None:
-        for run in self.experiment.search(_running_cells(sweep_run_id)):
+        for run in self.experiment.search(running_cells(sweep_run_id)):
             self._close_run(run.info.run_id, "KILLED", {"reason": "the sweep ended"})
 
     def restore(self, sweep_run_id: str) -> None:
@@ -293,10 +290,6 @@ class Tracker:
             self.client.delete_logged_model(model.model_id)  # its upload was cut off and would look unfinished for ever
         self.client.log_batch(run_id, tags=_tags({**tags, "state": status.lower()}))
         self.client.set_terminated(run_id, status)
-
-
-def _running_cells(sweep_run_id: str) -> str:
-    return f"tags.kind = 'cell' and attributes.status = 'RUNNING' and tags.`{PARENT}` = '{sweep_run_id}'"
 
 
 def _short(text: str) -> str:
