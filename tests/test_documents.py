@@ -111,7 +111,7 @@ def run_study(module: str, words: list[str], monkeypatch: pytest.MonkeyPatch) ->
     if (module, words[0]) == ("study.data", "import"):
         assert main(words) == 0
         return
-    if module == "study.sweep" and words[0] not in {"status", "verify", "drive", "train", "import"}:
+    if module == "study.sweep" and words[0] not in {"status", "verify", "drive", "train", "import", "clean"}:
         assert main([*words, *["--dry-run"] * ("--dry-run" not in words)]) == 0
         return
 
