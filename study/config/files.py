@@ -68,6 +68,15 @@ def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
     return merged
 
 
+def _files_with(kind: str, name: str, folder: Path) -> dict[str, Path]:
+    files = named_files(folder)
+    if not files:
+        raise BadInputError(f"no {kind} files in {folder.absolute()}: start in the project's folder, which has them")
+    if name not in files:
+        raise one_of(kind, name, files)
+    return files
+
+
 def load_grid(
     name: str, overrides: dict[str, Any] | None = None, folder: Path = HERE.sweeps, profile: str = "laptop"
 ) -> Grid:
@@ -75,9 +84,7 @@ def load_grid(
 
     Raises BadInputError for an unknown name or setting.
     """
-    files = named_files(folder)
-    if name not in files:
-        raise one_of("sweep", name, files or [f"nothing: there are no sweep files in {folder.absolute()}"])
+    files = _files_with("sweep", name, folder)
     content = merge(read_yaml(files[name]), overrides or {}) | {"name": name}
     by_profile = content.pop("profile_settings", {})
     if not isinstance(by_profile, dict):
@@ -106,7 +113,5 @@ def _of_profile(value: object, profile: str) -> object:
 
 def load_profile(name: str, overrides: dict[str, Any] | None = None, folder: Path = HERE.sweeps) -> StudySettings:
     """Return the profile of that name. Raises BadInputError for an unknown profile or setting."""
-    files = named_files(folder / "profiles")
-    if name not in files:
-        raise one_of("profile", name, files)
+    files = _files_with("profile", name, folder / "profiles")
     return validated(StudySettings, merge(read_yaml(files[name]), overrides or {}), f"profile {name}")
