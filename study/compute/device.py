@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import resource
+import sys
 from typing import Any, Literal
 
 import torch
@@ -94,4 +95,5 @@ def describe_determinism() -> dict[str, Any]:
 
 def peak_bytes() -> int:
     """Return the most memory that this process has held so far."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    unit = 1 if sys.platform == "darwin" else 1024  # [bytes]; macOS counts bytes, Linux KiB
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
