@@ -327,6 +327,18 @@ def test_auto_is_fp32_where_the_processor_has_no_bf16(monkeypatch: pytest.Monkey
     assert choose_precision("fp32", cpu) == "fp32"
 
 
+def test_an_apple_gpu_is_chosen_when_asked_for_and_computes_in_fp32(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What torch would find is given: there may be no such GPU here."""
+    monkeypatch.setattr("torch.backends.mps.is_available", lambda: True)
+    assert (device.choose_device("mps"), device.device_name("mps")) == ("mps", device.APPLE)
+    assert device.choose_device("auto") != "mps"
+    assert choose_precision("auto", torch.device("mps")) == "fp32"
+    with pytest.raises(BadInputError, match=r"bf16 .* 'mps'; choose from auto, fp32"):
+        choose_precision("bf16", torch.device("mps"))
+    with pytest.raises(BadInputError, match="'mps:1' is not on this machine"):
+        device.choose_device("mps:1")
+
+
 def test_variational_adds_a_layer_and_its_loss(frames: Frames) -> None:
     plain, variational = train(frames, "rec"), train(frames, "rec", SETTINGS.model_copy(update={"beta": 1.0}))
     assert variational.weights.keys() - plain.weights.keys() == {"log_variance.weight", "log_variance.bias"}

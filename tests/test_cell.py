@@ -36,6 +36,16 @@ def new_job(small_store, small_drives, tmp_path):
     return make
 
 
+def test_beside_an_apple_gpu_policies_are_trained_on_the_cpu_in_shares(new_job, monkeypatch):
+    monkeypatch.setattr(flow, "SHARE_SECONDS", 1e-6)
+    steps = cell_flow(new_job(device="mps", cell=Cell(heads=CEILING)), one_share=True)
+    (latents,) = next(steps).tasks
+    policies = steps.send(["latents"]).tasks
+    assert latents.accelerated
+    assert [task.accelerated for task in policies] == [False] * SEEDS
+    assert {task.args[0].policy_device for task in policies} == {"cpu"}
+
+
 def run(job, **how):
     """Return the result, the network, and the stages that reported progress."""
     stages = []

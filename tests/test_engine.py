@@ -304,6 +304,7 @@ def test_jobs_of_a_batch_system_work_over_tls(tmp_path, monkeypatch):
         (None, 2, "cuda:1", ["1"]),
         (None, 2, "cuda:2", []),
         (None, 2, "cpu", []),
+        (None, 0, "mps", ["mps"]),
         ("", 0, "auto", []),
         ("3,5", 2, "auto", ["3", "5"]),
         ("3,5", 2, "cuda:1", ["5"]),

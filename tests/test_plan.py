@@ -3,10 +3,13 @@
 import shlex
 
 import pytest
+import torch
 
 from study.errors import BadInputError
 from study.sweep.__main__ import main
 from tests.support.plans import plan_of
+
+NO_APPLE = pytest.mark.skipif(torch.backends.mps.is_available(), reason="this machine has an Apple GPU")
 
 
 @pytest.mark.parametrize(
@@ -18,6 +21,7 @@ from tests.support.plans import plan_of
         (["--certificates", "here"], "--certificates goes with --cluster tls://"),
         (["--certificates", "here", "--cluster", "tcp://127.0.0.1:8786"], "--certificates goes with --cluster tls://"),
         (["--device", "cuda:99"], "choose from cpu"),
+        pytest.param(["--device", "mps"], "'mps' is not on this machine; choose from cpu", marks=NO_APPLE),
         (["--dynamics.lag", "3"], "takes 37 m, and the autopilot looks 30 m ahead"),
     ],
 )

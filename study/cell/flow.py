@@ -45,7 +45,9 @@ def cell_flow(job: CellJob, *, one_share: bool = False) -> Flow[tuple[CellResult
         folder = job.products / f"encoder-{ENCODER.key(job.work)}"
         (encoder,) = yield from _keep([folder], ("weights", "samples"), [_task(ENCODER, "train_cell_encoder", job)])
     (latents,) = yield Batch([_task(LATENTS, "encode_policy_set", job, encoder)])
-    count = 1 if one_share else min(job.policy_seeds, math.ceil(2 * POLICY.cost(job.work) / SHARE_SECONDS))
+    count = min(job.policy_seeds, math.ceil(2 * POLICY.cost(job.work) / SHARE_SECONDS))
+    if one_share and job.policy_device == job.device:
+        count = 1
     shares = [share.tolist() for share in np.array_split(np.arange(job.policy_seeds), count)]
     policies = yield from _keep(
         [job.products / f"policies-{job.key}-{seeds[0]}-{seeds[-1]}" for seeds in shares],
@@ -89,8 +91,9 @@ def drive_flow(
     return table, films
 
 
-def _task(stage: Stage, function: str, *args: Any, weight: int = 1) -> Task:
-    return Task(stage, f"{STAGE_MODULE}:{function}", args, weight, reports=True, accelerated=True)
+def _task(stage: Stage, function: str, job: CellJob, *args: Any, weight: int = 1) -> Task:
+    accelerated = stage is not POLICY or job.policy_device == job.device
+    return Task(stage, f"{STAGE_MODULE}:{function}", (job, *args), weight, reports=True, accelerated=accelerated)
 
 
 def product_folders(job: CellJob) -> list[Path]:

@@ -39,6 +39,11 @@ class CellJob:
         return Work(self.settings, self.cell, self.policy_seeds, self.frames.name)
 
     @property
+    def policy_device(self) -> str:
+        """Return where policies are trained: beside an Apple GPU on the CPU, for whose cores they are small enough."""
+        return "cpu" if self.device == "mps" else self.device
+
+    @property
     def products(self) -> Path:
         """Return the folder that keeps the products of finished stages."""
         return self.scratch / "products"

@@ -113,7 +113,7 @@ def train_policy_share(job: CellJob, latents: Latents, seeds: list[int], report:
         latents.labels_test,
         seeds,
         job.settings.policy,
-        device=_set_up(job, report),
+        device=_set_up(job, report, job.policy_device),
         log=partial(report, "log"),
         progress=partial(report, "progress"),
     )
@@ -183,7 +183,7 @@ def assemble_result(
 def begin(job: CellJob, report: Reporter) -> tuple[FrameStore, str, dict[str, Any]]:
     """Return the frames, made here where they are missing, the device, and facts about what computes."""
     load_modules(job.modules)
-    device = _set_up(job, report)
+    device = _set_up(job, report, job.device)
     seeds = {
         "recording": job.settings.recording.seed,
         "frames": job.settings.frames.seed,
@@ -202,9 +202,9 @@ def begin(job: CellJob, report: Reporter) -> tuple[FrameStore, str, dict[str, An
     return store, device, {"device": device_name(device), "provenance": origin}
 
 
-def _set_up(job: CellJob, report: Reporter) -> str:
-    """Set the number of threads, and return the device."""
+def _set_up(job: CellJob, report: Reporter, name: str) -> str:
+    """Set the number of threads, and return the device of that name."""
     torch.set_num_threads(job.threads)
-    device = choose_device(job.device)
+    device = choose_device(name)
     report("device", device_name(device))
     return device

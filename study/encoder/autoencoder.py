@@ -137,7 +137,7 @@ class MultiHeadAutoencoder(lightning.LightningModule):
 
     def _note(self, split: Split, losses: Tensor, count: int) -> None:
         weighted = torch.cat([losses, losses.new_ones(1)]).to(_accurate(losses.device)) * count
-        self.sums[split] = self.sums[split].to(weighted.dtype).to(losses.device, non_blocking=True) + weighted
+        self.sums[split] = self.sums[split].to(weighted.dtype).to(losses.device) + weighted
         self.totals[split].append(losses[0])
 
     def reset_means(self) -> None:

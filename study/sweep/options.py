@@ -72,7 +72,9 @@ def check_device(name: str) -> None:
         pkgutil.resolve_name("study.compute.device:check_device")(name)
 
 
-device = click.option("--device", default="auto", metavar="D", help="cpu, cuda, cuda:1, ... [cuda where there is one]")
+device = click.option(
+    "--device", default="auto", metavar="D", help="cpu, cuda, cuda:1, ..., mps [cuda where there is one]"
+)
 threads = click.option(
     "--threads",
     type=click.IntRange(min=1),

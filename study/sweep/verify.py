@@ -23,6 +23,8 @@ from numpy.typing import NDArray
 
 from study.cell.flow import cell_flow
 from study.cell.job import CellJob
+from study.compute.device import APPLE
+from study.compute.gpus import visible_gpus
 from study.compute.provenance import cores
 from study.config.grid import Cell
 from study.config.keys import cell_key
@@ -156,6 +158,9 @@ def compute_again(plan: Plan, recorded: CellResult, display: Display, workers: i
     name = recorded.facts["device"]
     alike = [gpu for gpu in gpus if torch.cuda.get_device_name(int(gpu)) == name]
     use = [] if name.lower() == "cpu" else (alike or gpus)[:1]
+    device = "auto" if use else "cpu"
+    if name == APPLE and torch.backends.mps.is_available():
+        use = visible_gpus(device := "mps")
     with (
         local_engine(workers or cores(), plan.workspace.tmp, use) as engine,
         tempfile.TemporaryDirectory(prefix=".verify-", dir=plan.workspace.data) as scratch,
@@ -170,7 +175,7 @@ def compute_again(plan: Plan, recorded: CellResult, display: Display, workers: i
             frames,
             plan.drives,
             Path(scratch),
-            "auto" if use else "cpu",
+            device,
             int(recorded.facts["threads"]),
             plan.imported,
             plan.grid.modules,
