@@ -16,6 +16,7 @@ from study.errors import BadInputError
 from study.figures.fonts import Fonts, fonts_for
 from study.report import __main__, build
 from study.report.build import build_report
+from study.report.document import Paragraph, Table
 from study.report.markdown import markdown
 from study.report.model import read_report
 from study.report.scale import training_scale
@@ -239,6 +240,12 @@ def test_other_grids_give_reports_too(grid, tmp_path):
     content = json.loads((tmp_path / grid.name / "report.json").read_text())
     assert content["sweep"]["design"] == ("B" if grid.encoder_seeds > 1 else "A")
     assert pdf.stat().st_size > 10_000
+
+
+def test_no_table_of_a_report_without_baselines_is_set_as_words():
+    blocks = document(summarise(simulate(SMALL)))
+    assert not [block.text for block in blocks if isinstance(block, Paragraph) and "| --" in block.text]
+    assert any(isinstance(block, Table) and block.caption.startswith("Final scores") for block in blocks)
 
 
 def test_the_datasize_report_has_its_claims(tmp_path):

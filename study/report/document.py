@@ -95,13 +95,13 @@ def table(header: Sequence[str], rows: Iterable[Sequence[object]], left: int = 1
 
 
 def parse(text: str, pictures: Mapping[str, str]) -> Iterator[Block]:
-    """Yield the blocks of a text, which blank lines separate.
+    """Yield the blocks of a text, which blank lines separate, but for one before a table's header.
 
     `#` starts a heading and `>` a notice. `Table: CAPTION` is followed by a header, a line of alignments, rows, and
     notes; a table without any row is left out. `Figure: NAME` is followed by a caption and `Alt:` with the same in
     words; a figure that is not in `pictures`, by name its file, is left out.
     """
-    for block in filter(None, (part.strip() for part in re.split(r"\n\s*\n", text))):
+    for block in filter(None, (part.strip() for part in re.split(r"\n\s*\n(?!\|)", text))):
         words = " ".join(block.split())
         if heading := re.fullmatch(r"(#+) (.*)", words):
             yield Heading(len(heading[1]), heading[2])
