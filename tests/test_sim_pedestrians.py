@@ -85,7 +85,9 @@ def test_they_cross_only_while_the_light_of_the_arm_is_red_and_many_do() -> None
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_traffic_flows_nearly_as_without_them(seed: int) -> None:
-    with_them, without = (drive(make_traffic(town, seed), 120) for town in (TOWN, WITHOUT))
+    road = make_traffic(TOWN, seed)
+    with_them, without = drive(road, 120), drive(make_traffic(WITHOUT, seed), 120)
+    assert road.collided == 0
     assert np.mean(with_them) > 0.85 * np.mean(without)
     assert np.mean(with_them[-300:]) > 0.8 * np.mean(without[-300:]), "it gets no slower with time"
 

@@ -20,7 +20,7 @@ from study.sim.autopilot import MOST_STEERING, REACH, Decisions, Fleet
 from study.sim.dynamics import BRAKE, DT, LOOK, THROTTLE, TOP_SPEED, check_dynamics, follow_command
 from study.sim.geometry import LENGTH, Floats, Pose
 from study.sim.lights import LightPlan, plan_lights
-from study.sim.pedestrians import Pedestrians, lay_walks
+from study.sim.pedestrians import Pedestrians
 from study.sim.road import TownNetwork, TownRoad, TownVehicle
 from study.sim.town import Town, draw_town
 
@@ -307,5 +307,5 @@ def make_traffic(
     lights = plan_lights(town, settings, light_rng)
     walkers = None
     if settings.pedestrians:
-        walkers = Pedestrians(lay_walks(town), settings.pedestrians, lights, rng(seed, "pedestrians"))
+        walkers = Pedestrians(town, settings.pedestrians, lights, rng(seed, "pedestrians"))
     return Traffic(town, settings, dynamics, traffic_rng, fast=fast, lights=lights, pedestrians=walkers)

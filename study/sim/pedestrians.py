@@ -28,6 +28,7 @@ PACE = (1.3, 1.7)  # slowest and fastest [m/s]
 PASSED = WIDTH / 2 + SIZE  # beyond the middle of a lane, a pedestrian is out of the way of its vehicles [m]
 ROOM = 0.5  # that a vehicle has left, at least, when it stops for a pedestrian who sets off [m]
 CREEP = 0.5  # a slower vehicle within a junction waits there [m/s]
+APART = 8.0  # beyond the stop line, turns from one lane are so far apart that one may stop there [m]
 SPARE = 0.5  # of the red, when a pedestrian has crossed [s]
 
 
@@ -110,8 +111,9 @@ def _corners(arm: int, places: Floats) -> Floats:
 class Pedestrians:
     """All pedestrians of a drive. Arrays have one entry for each; draws come from `rng` alone."""
 
-    def __init__(self, walks: Walks, count: int, lights: LightPlan, rng: np.random.Generator) -> None:
-        self.walks, self.lights, self.rng = walks, lights, rng
+    def __init__(self, town: Town, count: int, lights: LightPlan, rng: np.random.Generator) -> None:
+        self.walks, self.lights, self.rng = lay_walks(town), lights, rng
+        self.entry = np.array([move.entry for move in town.movements], np.int64)
         self.aside = rng.uniform(-ASIDE, ASIDE, (count, 2))
         self.pace = rng.uniform(*PACE, count)
         self.way = np.zeros(count, np.int64)
@@ -119,10 +121,10 @@ class Pedestrians:
         self.progress = np.zeros(count)
         self.red = float((lights.cycle - lights.green - lights.yellow).min()) - SPARE
         for number in range(count):
-            corners = rng.permutation(len(walks.onward)).tolist()
+            corners = rng.permutation(len(self.walks.onward)).tolist()
             self._take(number, next(corner for corner in corners if self._options(number, corner)))
             if not self.waiting[number]:
-                self.progress[number] = rng.random() * walks.length[self.way[number]]
+                self.progress[number] = rng.random() * self.walks.length[self.way[number]]
 
     def __len__(self) -> int:
         """Return how many there are."""
@@ -177,7 +179,8 @@ class Pedestrians:
     def gaps(self, fleet: Fleet) -> Floats:
         """Return the way from each vehicle's bumper to a crossing with someone who has yet to pass its lane [m].
 
-        It is inf where there is none within LOOK.
+        It is inf where there is none within LOOK. A vehicle that enters the junction from the same lane, on whatever
+        turn, ends the way, too, since it may stop for someone.
         """
         crossing, near, front = self._crossings(fleet)
         on = ((self.walks.crossing[self.way] >= 0) & ~self.waiting).nonzero()[0]
@@ -187,8 +190,12 @@ class Pedestrians:
         stops = someone.any(axis=-1) & (near >= 0) & (near <= LOOK)
         room = fleet.first_crossing[fleet.move] - front  # before the way of oncoming vehicles, which must stay free
         near[1] = np.where(room >= 0, np.minimum(near[1], room), near[1])
-        gaps: Floats = np.where(stops, near, np.inf).min(axis=0)
-        return gaps
+        gaps = np.where(stops, near, np.inf).min(axis=0)
+        rear, entry = front - LENGTH, np.where(fleet.move >= 0, self.entry[fleet.move], -1)
+        ahead = rear - front[:, None]
+        follows = (entry[:, None] == entry) & (front > 0) & (rear < APART) & (ahead >= 0) & (ahead <= LOOK)
+        free: Floats = np.minimum(gaps, np.where(follows, ahead, np.inf).min(axis=1))
+        return free
 
     def _crossings(self, fleet: Fleet) -> tuple[Ints, Floats, Floats]:
         """Return the crossings before and behind each vehicle's next or present movement, and the way to them, [2, N].
