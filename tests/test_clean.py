@@ -216,7 +216,8 @@ def test_a_cleaning_that_was_killed_is_finished_by_the_next(store):
     process = subprocess.Popen([sys.executable, "-m", "study.sweep", *words], cwd=store.folder, start_new_session=True)
     deadline = time.monotonic() + PATIENCE
     total = len(store.database.query("select * from runs"))
-    while len(store.database.query("select * from runs")) == total and time.monotonic() < deadline:
+    while process.poll() is None and len(store.database.query("select * from runs")) == total:
+        assert time.monotonic() < deadline
         time.sleep(0.01)
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
