@@ -34,8 +34,8 @@ SCORES: dict[str, Metric] = {  # a mean over drives
             name=DRIVING,
             title="driving score",
             digits=1,
-            about="Driving score, 0 to 100: route completion times a penalty for each infraction, 0.60 for a collision "
-            "with a vehicle, 0.65 for leaving the road, 0.70 for a red light (CARLA leaderboard 1.0).",
+            about="Driving score, 0 to 100: route completion times a penalty for each infraction, 0.50 for hitting a "
+            "pedestrian, 0.60 for a vehicle, 0.65 for leaving the road, 0.70 for a red light (CARLA leaderboard 1.0).",
         ),
         Metric(
             name="route_completion",
