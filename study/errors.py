@@ -53,7 +53,7 @@ GO_ON = "make room or name another folder, then give the same command again: it 
 def write_failure(error: BaseException) -> str | None:
     """Return what to tell a user when an error, or one behind it, says that a file cannot be written; else None."""
     if isinstance(error, OSError) and error.errno in WRITE_ERRORS:
-        return f"cannot write {error.filename or 'a file'}: {error.strerror}; {GO_ON}"
+        return f"cannot write {error.filename2 or error.filename or 'a file'}: {error.strerror}; {GO_ON}"
     if swept := _swept(error):
         return f"the folder {swept} is not there, or was removed while it was in use; {GO_ON}"
     if not isinstance(error, BadInputError) and any(words in str(error).lower() for words in WRITERS):
@@ -77,7 +77,7 @@ def full_place(error: BaseException) -> str | None:
     behind: BaseException | None = error
     while behind is not None:
         if isinstance(behind, OSError) and behind.errno in FULL:
-            return str(behind.filename or "")
+            return str(behind.filename2 or behind.filename or "")  # a copy names its source first
         if any(words in str(behind).lower() for words in FULL_WORDS):
             return ""
         behind = behind.__cause__ or (None if behind.__suppress_context__ else behind.__context__)

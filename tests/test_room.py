@@ -1,6 +1,7 @@
 """A full disk is waited for; temporary files that are swept away are made again, or named."""
 
 import shutil
+import sqlite3
 import tempfile
 from pathlib import Path
 
@@ -12,9 +13,10 @@ import torch
 from study.atomic import atomic_folder, scratch_folder, write_atomic
 from study.engine import room
 from study.engine.room import TRIES, with_room
-from study.errors import write_failure
+from study.errors import BadInputError, write_failure
 from study.products import read_product, write_product
 from study.stages import ENCODER, Batch, Task
+from study.tracking import experiment
 from tests.support.listeners import run_and_record
 from tests.test_flows import Machine
 
@@ -82,6 +84,17 @@ def test_stderr_is_told_once_what_is_waited_for(monkeypatch, capsys):
     with_room(lambda: failing(1, calls))
     said = capsys.readouterr().err
     assert said == ("no room to write in data/products/one: 5 MB free, 48 MB are needed; waiting up to 30 min for it\n")
+
+
+def test_a_copy_waits_for_room_where_it_goes_and_a_store_has_a_disk_of_its_own(monkeypatch, capsys, tmp_path):
+    copying = OSError(28, "No space left on device", "data/here", None, "mlruns/there")
+    masked = BadInputError(f"the tracking store gave no usable answer: {copying}")
+    for error, place in ((copying, "mlruns/there"), (masked, str(tmp_path))):
+        full, calls = {place}, []
+        monkeypatch.setattr(room, "_free", lambda at, full=full: 0 if at in full else 10**12)
+        monkeypatch.setattr(room, "_sleep", lambda _, full=full: full.clear())
+        assert with_room(lambda calls=calls, error=error: failing(1, calls, error), into=tmp_path) == "done"
+        assert f"no room to write in {place}: " in capsys.readouterr().err
 
 
 def test_cells_that_wait_for_the_same_room_are_told_once_and_finish(monkeypatch):
@@ -176,3 +189,12 @@ def test_temporary_files_have_a_folder_again_after_a_sweep(tmp_path, monkeypatch
         sweep(tmp_path)
     with scratch_folder() as name:
         assert Path(name).parent == tmp_path / "data/tmp"
+
+
+def test_a_store_for_which_no_room_is_left_asks_for_room(tmp_path, monkeypatch):
+    def create(_):
+        raise sqlite3.OperationalError("database or disk is full")
+
+    monkeypatch.setattr(experiment, "create_database", create)
+    with pytest.raises(BadInputError, match="disk is full; make room or give another --tracking"):
+        experiment.open_experiment(f"{experiment.SQLITE}{tmp_path / 'mlflow.db'}", "study")

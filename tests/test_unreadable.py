@@ -76,6 +76,15 @@ def test_a_sweep_to_compare_with_that_cannot_be_read_is_named_and_the_report_is_
     assert "Left out, since it cannot be read" in markdown(document(report))
 
 
+def test_a_result_without_which_nothing_can_be_compared_is_named(store):
+    tracker, varied, _ = store
+    run = next(iter(tracker.reader.finished(tracker.reader.read_sweep_run(varied).planned).values()))
+    shutil.rmtree(artifacts(tracker, run) / "result")
+    record = complete_cells(tracker.reader, "pair", None)
+    assert record.variants == {}  # no pair of head sets is left
+    assert [run in line for line in record.unread] == [True]
+
+
 @pytest.mark.parametrize("content", [b"{", b"[1]", b'{"format_version": 1}', b"\xff\xfe", b"null"])
 def test_a_plan_of_any_content_breaks_no_other_report(store, content):
     tracker, varied, _ = store

@@ -24,11 +24,14 @@ NAP = 0.5  # [s] between two looks at Ctrl-C
 T = TypeVar("T")
 
 
-def with_room(action: Callable[[], T], tell: Callable[[str, str], None] | None = None) -> T:
+def with_room(
+    action: Callable[[], T], tell: Callable[[str, str], None] | None = None, *, into: Path | None = None
+) -> T:
     """Do something that can be done again; when a disk is full, wait for room and do it again.
 
     `tell` hears before each look at the disk where room is missing and what is waited for; by default, stderr is told
-    once. When there is no room in PATIENCE, or none for this write after TRIES, its error is raised.
+    once. Where an error names no file, it was to lie in the data, the temporary files or `into`. When there
+    is no room in PATIENCE, or none for this write after TRIES, its error is raised.
     """
     tell, pause, left = tell or _Once(), PAUSES[0], PATIENCE
     for number in range(TRIES):
@@ -38,7 +41,7 @@ def with_room(action: Callable[[], T], tell: Callable[[str, str], None] | None =
             known = full_place(error)
             if known is None or number == TRIES - 1:
                 raise
-            place = known or _fullest()
+            place = known or _fullest(HERE.data, Path(tempfile.gettempdir()), *([into] if into else []))
             while left > 0:
                 tell(place, _words(place))
                 _sleep(min(pause, left))
@@ -60,9 +63,9 @@ class _Once:
         self._told.add(place)
 
 
-def _fullest() -> str:
-    """Return the folder with the least room of those that a study writes to."""
-    return min((str(HERE.data.absolute()), tempfile.gettempdir()), key=_free)
+def _fullest(*folders: Path) -> str:
+    """Return the folder with the least room."""
+    return min((str(folder.absolute()) for folder in folders), key=_free)
 
 
 def _words(place: str) -> str:

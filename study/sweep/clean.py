@@ -31,6 +31,7 @@ from study.tracking.reader import Reader
 
 DAY = 86400.0  # [s]
 LEAST = 6  # characters of a run id that name a sweep
+UNKNOWN = "its plan cannot be read, or another version of this program has made it"
 
 
 @dataclass(frozen=True)
@@ -146,7 +147,7 @@ def _plan(store: Store, choice: Choice) -> Cleaning:
         if not each.key or (each.key not in kept and (choice.unused or each.key in theirs))
     ]
     if unknown and cached:
-        notes.append(f"kept: cached data, since another version of this program has planned {', '.join(unknown)}")
+        notes.append(f"kept: cached data, since what {', '.join(unknown)} uses is unknown: {UNKNOWN}")
         cached = []
     return Cleaning(chosen, deletion, cached, notes)
 
@@ -196,7 +197,7 @@ def _list(store: Store, tracking: str, workspace: Workspace) -> None:
     print(f"cached data in {workspace.data}{'' if store.cached else ': none'}")
     _table(_cache_rows((each, store.users(each)) for each in store.cached))
     if unknown := [sweep.title for sweep in store.sweeps if store.keys[sweep.id] is None and sweep.state != "deleted"]:
-        print(f"what {', '.join(unknown)} uses is unknown: another version of this program has planned it")
+        print(f"what {', '.join(unknown)} uses is unknown: {UNKNOWN}")
 
 
 def _sweep_row(sweep: StoredSweep, now: float) -> tuple[str, ...]:

@@ -55,9 +55,8 @@ class Committing:
         self._failed: dict[str, str] = {}
         self._one_share = accelerated
         labels = {key: cell.label for key, cell in plan.cells.items()}
-        self._trials = Trials(
-            store_folder(plan.workspace, options.tracking) / "optuna.db", plan.study_name, labels, order
-        )
+        self._store = store_folder(plan.workspace, options.tracking)
+        self._trials = Trials(self._store / "optuna.db", plan.study_name, labels, order)
         # A file that cannot be written is no matter of seconds; a server that was restarted is.
         self._patience = 0.0 if tracker.experiment.is_file else PATIENCE
 
@@ -171,7 +170,7 @@ class Committing:
             before_sleep=say,
             reraise=True,
         )
-        return with_room(lambda: tries(action, *args, **kwargs))
+        return with_room(lambda: tries(action, *args, **kwargs), into=self._store)
 
     def __enter__(self) -> Self:
         return self

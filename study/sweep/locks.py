@@ -45,7 +45,7 @@ def hold_store(workspace: Workspace, tracking: str, holder: str, *, wait: bool) 
             raise BadInputError(
                 f"{who} runs on this store ({masked(tracking)}); wait for it, or give --wait to start when it ends"
             ) from None
-        print(f"waiting for {who}, which runs on this store", file=sys.stderr)
+        print(f"waiting for {who} which runs on this store", file=sys.stderr)
         lock.acquire()
     try:
         note.write_text(json.dumps({"holder": holder, "process": os.getpid()}), encoding="utf-8")

@@ -82,7 +82,8 @@ def _cell_status(plan: Plan, key: str, attempts: Sequence[Attempt], now: float) 
     if last.status != "RUNNING":
         return status
     tags = last.tags
-    quiet = max(0.0, now - float(tags.get("alive", last.started)) / 1000)
+    heard = float(tags.get("alive", last.started)) / 1000
+    quiet = abs(now - heard)  # a sign from the future tells no more than an old one
     state: State = "silent" if quiet > SILENT else "running"
     stage, _, steps = tags.get("progress", "").partition(" ")
     part, total = (int(number) for number in steps.split("/")) if steps else (0, 1)

@@ -27,7 +27,7 @@ from sqlalchemy.exc import SQLAlchemyError  # MLflow depends on sqlalchemy and l
 
 from study.atomic import scratch_folder
 from study.config.workspace import HERE
-from study.errors import BadInputError, masked
+from study.errors import BadInputError, full_place, masked
 from study.tracking.run_page import experiment_tags
 from study.tracking.schema import has_tables
 
@@ -310,8 +310,9 @@ def _usable_database(shown: str, database: Path | None) -> Iterator[None]:
         yield
     except (OSError, sqlite3.Error, SQLAlchemyError, MlflowException) as error:
         reason = getattr(error, "orig", None) or error
+        step = "move the file away" if full_place(error) is None else "make room"
         raise BadInputError(
-            f"{shown} cannot be used as a tracking store: {reason}; move the file away or give another --tracking"
+            f"{shown} cannot be used as a tracking store: {reason}; {step} or give another --tracking"
         ) from None
 
 

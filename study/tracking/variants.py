@@ -33,7 +33,7 @@ def with_variants(reader: Reader, record: SweepRecord) -> SweepRecord:
             continue
         except BadInputError:  # planned by another version: nothing to compare with
             continue
+        unread += [f"sweep {run.info.run_name}, to compare with: {line}" for line in variant.unread]
         if contrasts(record, variant, confound):
             variants[confound.setting] = variant
-            unread += [f"sweep {run.info.run_name}, compared with: {line}" for line in variant.unread]
     return replace(record, variants=variants, unread=tuple(dict.fromkeys(unread)))
