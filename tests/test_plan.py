@@ -46,3 +46,8 @@ def test_a_plans_command_makes_the_same_plan():
     assert program == ["python", "-m", "study.sweep"]
     assert plan_of(again) == plan
     assert plan != plan_of(words[:3])
+
+
+def test_to_drive_behind_imported_drives_is_refused(tmp_path):
+    with pytest.raises(BadInputError, match="no town to drive in"):
+        plan_of(["heads", "--data", str(tmp_path), "--drive", "true"])

@@ -46,6 +46,9 @@ def test_the_label_names_what_the_row_holds(small_store):
     labels.loc[0, ["acceleration", "steering", "speed", "light", "light_distance", "lead_gap"]] = 0, -0.1, 5, 2, 12, 8
     text = label_text(dataclasses.replace(frames, labels=labels), 0)
     assert text == "command -1, steering -0.100\n5.0 m/s, red in 12 m, gap 8 m"
+    labels["lead_gap"] = np.nan
+    text = label_text(dataclasses.replace(frames, labels=labels), 0)
+    assert text.endswith("red in 12 m"), "where nobody has written gaps, none is known"
 
 
 def test_the_film_shows_the_egos_bird_view_in_real_time(tmp_path):

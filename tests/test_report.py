@@ -166,6 +166,9 @@ def test_a_report_on_imported_drives_names_their_writer_and_not_our_town(incompl
     text = pdf_text(incomplete / "heads.pdf")
     assert "imported drives, written by lab logger 3" in text
     assert "a town of our own" not in text
+    assert "frames.balance" in text
+    assert not re.search(r"(town|recording|driving)\.[a-z_]+ ", text), "settings that imported drives do not have"
+    assert "make heads" not in text, "it would make another report"
 
 
 @pytest.mark.parametrize(("date", "younger"), [("2026-04-30", False), ("2026-05-02", True)])
@@ -424,7 +427,7 @@ def test_a_report_without_drives_has_no_page_and_no_table_of_them(driven, tmp_pa
     assert read_report(folder / "heads").driving is None
     text = pdf_text(folder / "heads.pdf")
     assert "At the wheel" not in text
-    assert "Its policies have not driven (--drive true)" in text
+    assert "Its policies have not driven (--drive true;" in text
 
 
 @pytest.mark.parametrize(

@@ -76,7 +76,7 @@ def convert(name: str, sources: Sequence[Path], out: Path, cut: float, **options
         if isinstance(value, float) and not math.isfinite(value):
             raise BadInputError(f"--{option.replace('_', '-')}: {value} is not a number of seconds")
     converter = import_module(f"study.convert.{name}")
-    print(*converter.convert(sources, out, cut, **options), out, sep="\n")
+    print(*converter.convert(sources, out, cut, **options), out, f"next: python -m study.data import {out}", sep="\n")
     return 0
 
 

@@ -68,9 +68,10 @@ def label_text(frames: Frames, row: int) -> str:
     label = frames.labels.iloc[row]
     light = ("no red light", "yellow", "red")[int(label["light"])]
     light += f" in {label['light_distance']:.0f} m" if label["light"] else ""
-    free = "way free" if np.isnan(label["lead_gap"]) else f"gap {label['lead_gap']:.0f} m"
+    gap = "way free" if np.isnan(label["lead_gap"]) else f"gap {label['lead_gap']:.0f} m"
+    known = frames.labels["lead_gap"].notna().any()  # else nobody has written gaps: the way may be free or not
     command = f"command {ACCELERATIONS[int(label['acceleration'])]:g}, steering {label['steering']:+.3f}"
-    return f"{command}\n{label['speed']:.1f} m/s, {light}, {free}"
+    return f"{command}\n{label['speed']:.1f} m/s, {light}" + (f", {gap}" if known else "")
 
 
 # --- film -----------------------------------------------------------------------------------------------------------

@@ -19,6 +19,7 @@ from study.config.workspace import HERE, Workspace
 from study.console.display import Display
 from study.data.prepare import drives_folder, frames_folder
 from study.episode.imported import Imported, open_import
+from study.errors import BadInputError
 from study.sim.dynamics import check_dynamics
 from study.stages import Cost, Work, cell_cost, data_cost
 
@@ -44,7 +45,7 @@ class Plan:
     @property
     def title(self) -> str:
         """Return the sweep and its profile, for people."""
-        return f"{self.grid.name} ({self.profile})"
+        return f"{self.grid.name} ({self.profile}{f', {self.imported.folder.name}' if self.imported else ''})"
 
     @property
     def frames(self) -> Path:
@@ -107,6 +108,8 @@ def make_plan(
     Raises BadInputError.
     """
     loaded = load_grid(name, grid, workspace.sweeps, profile)
+    if data and grid.get("drive"):
+        raise BadInputError(f"--drive true: behind the imported drives of {data} is no town to drive in; leave it out")
     settings = load_profile(profile, merge(loaded.settings, study), workspace.sweeps)
     imported = open_import(data) if data else None
     if imported:
