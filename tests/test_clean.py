@@ -215,13 +215,14 @@ def test_a_cleaning_that_was_killed_is_finished_by_the_next(store):
     words = ["clean", "heads", "--yes", "--tracking", store.uri]
     process = subprocess.Popen([sys.executable, "-m", "study.sweep", *words], cwd=store.folder, start_new_session=True)
     deadline = time.monotonic() + PATIENCE
-    total = len(store.database.query("select * from runs"))
-    while process.poll() is None and len(store.database.query("select * from runs")) == total:
+    marked = "select * from runs where lifecycle_stage = 'deleted'"
+    while not store.database.query(marked):  # seconds before `mlflow gc` has started, and removes them
+        assert process.poll() is None
         assert time.monotonic() < deadline
         time.sleep(0.01)
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
-    assert store.database.query("select * from runs where lifecycle_stage = 'deleted'")
+    assert store.database.query(marked)
     done = sweep(store.folder, *words)
     assert done.returncode == 0, done.stderr
     store.assert_heads_is_gone()
