@@ -578,7 +578,7 @@ def test_a_database_of_another_host_needs_a_place_for_artifacts_that_all_machine
         assert "secret" not in str(error.value)
 
 
-@pytest.mark.parametrize("name", ["a?b", "50%25"])
+@pytest.mark.parametrize("name", ['quote\'s "both"', "a?b", "50%25"])
 def test_a_folder_whose_name_mlflow_would_misread_is_refused_and_nothing_is_made(name, tmp_path, monkeypatch):
     (tmp_path / name).mkdir()
     monkeypatch.chdir(tmp_path / name)

@@ -198,10 +198,12 @@ def _connect(uri: str) -> tuple[MlflowClient, str, Path | None]:
         raise BadInputError(f"tracking URI '{shown}' cannot be used; give {HERE.tracking} or http://host:port")
     database, artifacts = database_file(uri), None
     if database:
-        if odd := {"?", "%"} & set(str(database)):
+        found = set(str(database))
+        quotes = {"'", '"'}  # MLflow can write one kind of them, not both
+        if odd := {"?", "%"} & found or (quotes if quotes <= found else set()):
             raise BadInputError(
-                f"{database} cannot be a tracking store: MLflow reads {' and '.join(sorted(odd))} in a folder's name "
-                "as something else; work in a folder without, or name one with --tracking"
+                f"{database} cannot be a tracking store: MLflow misreads {' and '.join(sorted(odd))} in a folder's "
+                "name; work in a folder without, or name one with --tracking"
             )
         _prepare_database(database, shown)
         uri, artifacts = f"{SQLITE}{database}", database.parent / "artifacts"
