@@ -83,7 +83,7 @@ def test_without_drives_claims_about_driving_say_how_to_test_them(still):
     found = verdicts(still)
     assert {verdict.outcome for verdict in found.values()} == {"not tested"}
     assert {verdict.reason for verdict in found.values()} == {
-        "Its policies have not driven (--drive true; behind imported drives is no town)."
+        "Its policies have not driven (--drive true; imported drives have no town)."
     }
 
 

@@ -166,7 +166,7 @@ def _why_not(claim: Claim, evidence: Evidence) -> tuple[str, tuple[str, ...]]:
     if missing:
         return f"Not finished: {', '.join(missing)}.", missing
     if not evidence.panels.get(claim.metric):
-        return "Its policies have not driven (--drive true; behind imported drives is no town).", ()
+        return "Its policies have not driven (--drive true; imported drives have no town).", ()
     missing = tuple(label(point, grid) for point in _points(pairs) if point not in evidence.panels[claim.metric])
     return (f"Not driven: {', '.join(missing)} (--drive true)." if missing else ""), missing
 

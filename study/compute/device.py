@@ -41,7 +41,7 @@ def choose_precision(setting: Literal["auto", "fp32", "bf16"], device: torch.dev
     """
     if device.type == "mps":
         if setting == "bf16":
-            raise BadInputError("encoder.precision bf16 is not there on device 'mps'; choose from auto, fp32")
+            raise BadInputError("encoder.precision bf16 is not available on device 'mps'; choose from auto, fp32")
         return "fp32"
     if setting != "auto":
         return setting

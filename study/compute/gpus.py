@@ -11,7 +11,7 @@ GPU_DRIVERS = ("/dev/nvidiactl", "/dev/kfd", "/dev/dxg")  # of CUDA, ROCm, and e
 def visible_gpus(device: str) -> list[str]:
     """Return CUDA's names of the GPUs that `--device` asks for: all of them for auto and cuda, one for cuda:N.
 
-    An Apple GPU has no name of CUDA's, is one, and is used only when asked for: nobody has compared it with a CPU yet.
+    An Apple GPU ("mps") is used only when asked for by name: nobody has compared it with a CPU yet.
     """
     if device == "mps":
         return ["mps"]

@@ -221,7 +221,7 @@ class Renderer:
         middle = (np.einsum("mij,mi->mj", affines[:, :, :2], centre) / scale**2).astype(np.float32)
         east = episode.x[steps] - middle[:, 0, None, None]
         north = episode.y[steps] - middle[:, 1, None, None]
-        near = east * east + north * north < np.float32(self.settings.view / 2**0.5 + self._reach) ** 2  # never: NaN
+        near = east * east + north * north < np.float32(self.settings.view / 2**0.5 + self._reach) ** 2  # NaN: far
         near &= episode.present[steps] & inside[..., None]
         place = near.ravel().nonzero()[0]  # much faster than `nonzero` of the table
         row, agent = np.divmod(place, near.shape[2])

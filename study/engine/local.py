@@ -54,9 +54,9 @@ def local_engine(workers: int, scratch: Path, gpus: Sequence[str] = ()) -> DaskE
 
 
 def _start_resource_tracker() -> None:
-    """Start the process of Python's that removes the semaphores of Dask's queues when this process ends at once.
+    """Start Python's resource tracker, which removes the semaphores of Dask's queues when this process ends at once.
 
-    It would warn of "leaked semaphore objects" then, although a stopped command leaves them to it on purpose.
+    Its warning of "leaked semaphore objects" is filtered out: a stopped command leaves them to it on purpose.
     """
     before = os.environ.get("PYTHONWARNINGS")
     os.environ["PYTHONWARNINGS"] = ",".join(filter(None, [before, "ignore:resource_tracker:UserWarning"]))

@@ -30,8 +30,8 @@ def with_room(
     """Do something that can be done again; when a disk is full, wait for room and do it again.
 
     `tell` hears before each look at the disk where room is missing and what is waited for; by default, stderr is told
-    once. Where an error names no file, it was to lie in the data, the temporary files or `into`. When there
-    is no room in PATIENCE, or none for this write after TRIES, its error is raised.
+    once. Where an error names no file, the disk is looked for among those of the data, the temporary files
+    and `into`. When there is no room in PATIENCE, or none for this write after TRIES, its error is raised.
     """
     tell, pause, left = tell or _Once(), PAUSES[0], PATIENCE
     for number in range(TRIES):

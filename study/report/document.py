@@ -95,7 +95,7 @@ def table(header: Sequence[str], rows: Iterable[Sequence[object]], left: int = 1
 
 
 def parse(text: str, pictures: Mapping[str, str]) -> Iterator[Block]:
-    """Yield the blocks of a text, which blank lines separate, but for one before a table's header.
+    """Yield the blocks of a text, which blank lines separate, except between a table's caption and its header.
 
     `#` starts a heading and `>` a notice. `Table: CAPTION` is followed by a header, a line of alignments, rows, and
     notes; a table without any row is left out. `Figure: NAME` is followed by a caption and `Alt:` with the same in

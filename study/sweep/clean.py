@@ -115,7 +115,7 @@ def clean(choice: Choice, tracking: str, *, show_only: bool, yes: bool, wait: bo
         _show(_plan(Store.look(tracking, workspace), choice))
         return 0
     if not yes and not sys.stdin.isatty():
-        raise BadInputError("nobody can be asked here, since this is no terminal; look with --dry-run, then add --yes")
+        raise BadInputError("this is not a terminal, so nobody can confirm; look with --dry-run, then add --yes")
     alone = sole_use(workspace.data, wait=wait) if workspace.data.is_dir() else nullcontext()
     with hold_store(workspace, tracking, "clean", wait=wait), alone:
         cleaning = _plan(Store.look(tracking, workspace), choice)

@@ -109,7 +109,7 @@ def make_plan(
     """
     loaded = load_grid(name, grid, workspace.sweeps, profile)
     if data and grid.get("drive"):
-        raise BadInputError(f"--drive true: behind the imported drives of {data} is no town to drive in; leave it out")
+        raise BadInputError(f"--drive true: the imported drives of {data} have no town to drive in; leave it out")
     settings = load_profile(profile, merge(loaded.settings, study), workspace.sweeps)
     imported = open_import(data) if data else None
     if imported:
