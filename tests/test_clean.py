@@ -293,7 +293,7 @@ def test_a_plan_that_cannot_be_read_protects_what_it_may_use(whole):
 def test_names_and_answers_are_checked(whole, tmp_path):
     refused(whole, "no sweep 'haeds' in this store; there are: heads, heads-encoders", "haeds")
     for words in ("heads",), ("--unused",):
-        with pytest.raises(BadInputError, match="this is no terminal; look with --dry-run, then add --yes"):
+        with pytest.raises(BadInputError, match="this is not a terminal, so nobody can confirm; look with --dry-run"):
             main(["clean", *words, "--tracking", whole.uri])
     with pytest.raises(BadInputError, match="no sweep 'heads' in this store; there are: none"):
         main(["clean", "heads", "--dry-run", "--tracking", f"{SQLITE}{tmp_path}/none.db"])

@@ -214,7 +214,12 @@ def test_the_command_writes_a_new_folder_only(tmp_path, capsys):
         str(tmp_path / "out"),
     ]
     assert main(words) == 0
-    assert capsys.readouterr().out == f"fcd: 20.0 s, 2 agents, 2 may be ego\n{tmp_path / 'out'}\n"
+    made = tmp_path / "out"
+    assert capsys.readouterr().out.splitlines() == [
+        "fcd: 20.0 s, 2 agents, 2 may be ego",
+        str(made),
+        f"next: python -m study.data import {made}",
+    ]
     with pytest.raises(BadInputError, match="holds something"):
         main(words)
 
