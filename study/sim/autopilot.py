@@ -245,12 +245,11 @@ class Fleet:
         low, middle, high = ACCELERATIONS
         acceleration = np.where(brake, low, np.where(kmh >= limit - 10, middle, high))
         known = (self.move >= 0) & (self.s <= self.move_start)
+        signals = self.move_signal if len(self.move_signal) else np.array([-1])
         return Decisions(
             steering=-self._steer(heading, speed, wheel) / self.dynamics.steering_unit,
             acceleration=acceleration,
-            light=np.where(known, self.move_signal[self.move], -1)
-            if len(self.move_signal)
-            else np.full(len(speed), -1),
+            light=np.where(known, signals[self.move], -1),
             light_distance=np.where(known, self.move_start - self.s, np.nan),
             route_s=self.s.copy(),
             lead_gap=lead_gap,
@@ -291,13 +290,15 @@ class Fleet:
         window = near[:, None] + np.arange(2, round((LOOK + LENGTH / 2 + 2) / SPACING), 2)
         px, py = self.x[rows[:, None], window], self.y[rows[:, None], window]
         dx, dy = px[i] - x[j][:, None], py[i] - y[j][:, None]
+        met = ((dx * dx + dy * dy).min(axis=1) < (LENGTH / 2 + WIDTH) ** 2).nonzero()[0]  # beyond, no sample is a hit
+        i, j, dx, dy = i[met], j[met], dx[met], dy[met]
         c, s = np.cos(heading)[j][:, None], np.sin(heading)[j][:, None]
         along = np.maximum(np.abs(dx * c + dy * s) - LENGTH / 2, 0)
         aside = np.maximum(np.abs(dy * c - dx * s) - WIDTH / 2, 0)
         away = along * along + aside * aside
         width = WIDTH / 2 + MARGIN
         hit = away < width * width
-        hits = hit.any(axis=1)
+        hits = hit.any(axis=1).nonzero()[0]
         i, j, away, k = i[hits], j[hits], np.sqrt(away[hits]), hit[hits].argmax(axis=1)
         pair = np.arange(len(i))
         before, after = away[pair, np.maximum(k - 1, 0)], away[pair, k]
@@ -306,8 +307,7 @@ class Fleet:
         distance = where * SPACING - self.s[i] + width - LENGTH / 2
         order = np.lexsort((distance, i))
         i, j, distance = i[order], j[order], distance[order]
-        nearest = np.ones(len(i), bool)
-        nearest[1:] = i[1:] != i[:-1]
+        nearest = np.diff(i, prepend=-1) > 0
         gap, lead = np.full(len(x), np.inf), np.full(len(x), -1)
         gap[i[nearest]], lead[i[nearest]] = distance[nearest], j[nearest]
         gap[gap > LOOK] = np.inf

@@ -18,7 +18,7 @@ from study.errors import BadInputError
 from study.randomness import rng
 from study.sim.autopilot import MOST_STEERING, REACH, Decisions, Fleet
 from study.sim.dynamics import BRAKE, DT, LOOK, THROTTLE, TOP_SPEED, check_dynamics, follow_command
-from study.sim.geometry import LENGTH, Floats, Pose
+from study.sim.geometry import LENGTH, Floats, Ints, Pose
 from study.sim.lights import LightPlan, plan_lights
 from study.sim.pedestrians import Pedestrians
 from study.sim.road import TownNetwork, TownRoad, TownVehicle
@@ -64,6 +64,7 @@ class Traffic(TownRoad):
         self.decisions: Decisions  # of the step that `decided` numbers
         self.decided = -1
         self.decided_pose: Pose  # from which they follow
+        self.decided_pairs: tuple[Ints, Ints]  # of vehicles within REACH of each other then
         streets = [k for k, strip in enumerate(town.strips) if k in town.ways and strip.piece.length > 2 * APART]
         self.streets = np.array(streets or sorted(town.ways), np.int64)
         pieces = [strip.piece for strip in town.strips]
@@ -110,9 +111,10 @@ class Traffic(TownRoad):
             pose = self.decided_pose = self.pose()
             self.light_states = self.lights.states(self.time)
             crossings = self.pedestrians.gaps(self.fleet) if self.pedestrians else np.inf
-            pairs = self.pairs_within(REACH, pose)
+            self.decided_pairs = self.pairs_within(REACH, pose)
+            controls = self.force, self.wheel
             self.decisions = self.fleet.decide(
-                self.steps, pose, (self.force, self.wheel), pairs, self.light_states, crossings
+                self.steps, pose, controls, self.decided_pairs, self.light_states, crossings
             )
             self.decided = self.steps
         return self.decisions
@@ -134,6 +136,10 @@ class Traffic(TownRoad):
                 self.vehicles, self.force.tolist(), self.wheel.tolist(), strict=True
             ):
                 vehicle.act({"acceleration": force_now, "steering": wheel_now})
+
+    def near_pairs(self) -> tuple[Ints, Ints]:
+        """Return what `TownRoad.near_pairs` does; those of the decision reach farther than a vehicle moves."""
+        return self.decided_pairs if self.decided == self.steps else super().near_pairs()
 
     def controls(self) -> tuple[Pose, Floats, Floats]:
         """Return what `TownRoad.controls` does, without asking every vehicle."""

@@ -21,6 +21,7 @@ from study.sim.town import Town, highway_lane
 
 CELL = 4.0  # side of a cell of the grid over the town [m]
 KNOWN = 9.0  # lanes this near to a cell's centre are listed with it [m]
+NEAR = 20.0  # vehicles whose centres are this far apart cannot touch within a step [m]
 TIE = 1e-9  # scores nearer than this are settled by highway-env's own arithmetic
 
 
@@ -207,7 +208,7 @@ class TownRoad(Road):
             super().step(dt)
             return
         self.moved = self._move(dt)
-        touching = self._touching(self.moved, dt)
+        touching = self._touching(self.moved, self.near_pairs(), dt)
         for i, j in zip(*touching, strict=True):
             self.vehicles[i].handle_collisions(self.vehicles[j], dt)
         self.struck = self.find_struck(np.unique(np.concatenate([self.struck, *touching])).astype(np.int64).tolist())
@@ -215,6 +216,10 @@ class TownRoad(Road):
     def find_struck(self, slots: Iterable[int]) -> list[int]:
         """Return which of these vehicles have crashed, or will overlap another after one more step."""
         return [k for k in slots if self.vehicles[k].crashed or self.vehicles[k].impact is not None]
+
+    def near_pairs(self) -> tuple[Ints, Ints]:
+        """Return at least the pairs, sorted, that may touch within this step."""
+        return self.pairs_within(NEAR, self.moved)
 
     def controls(self) -> tuple[Pose, Floats, Floats]:
         """Return the pose of all vehicles, and the acceleration [m/s2] and the wheel angle [rad] that act on them."""
@@ -243,17 +248,17 @@ class TownRoad(Road):
                 vehicle._lane_index = None  # noqa: SLF001 - its own kind; a call of `on_state_update` would cost more
         return self.pose() if odd else (x, y, heading, speed)
 
-    def _touching(self, pose: Pose, dt: float) -> tuple[Ints, Ints]:
-        """Return the pairs i < j that may touch within `dt`: no axis of the two moving boxes separates them."""
+    def _touching(self, pose: Pose, pairs: tuple[Ints, Ints], dt: float) -> tuple[Ints, Ints]:
+        """Return which pairs i < j may touch within `dt`: no axis of the two moving boxes separates them."""
         x, y, heading, speed = pose
+        i, j = pairs
+        dx, dy = x[j] - x[i], y[j] - y[i]
         reach = TownVehicle.LENGTH + TownVehicle.WIDTH + np.abs(speed) * dt  # more than highway-env's two diagonals
-        dx, dy = x[:, None] - x[None], y[:, None] - y[None]
-        i, j = true_pairs(dx * dx + dy * dy < (reach * reach)[:, None])
-        i, j = i[i < j], j[i < j]
+        met = ((dx * dx + dy * dy < (reach * reach)[i]) & (i < j)).nonzero()[0]
+        i, j, dx, dy = i[met], j[met], dx[met], dy[met]
         c, s = np.cos(heading), np.sin(heading)
         half_length, half_width = TownVehicle.LENGTH / 2, TownVehicle.WIDTH / 2
         apart = np.zeros(len(i), bool)
-        dx, dy = x[j] - x[i], y[j] - y[i]
         vx, vy = (speed[i] * c[i] - speed[j] * c[j]) * dt, (speed[i] * s[i] - speed[j] * s[j]) * dt
         parallel, across = np.abs(c[i] * c[j] + s[i] * s[j]), np.abs(c[i] * s[j] - s[i] * c[j])
         for k in (i, j):
