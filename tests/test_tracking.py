@@ -429,6 +429,17 @@ def test_the_latest_opened_sweep_of_a_name_is_read(tracker):
     assert tracker.reader.read_sweep("heads").profile == "smoke"
 
 
+def test_an_earlier_sweep_of_a_name_is_read_by_its_run_id(tracker):
+    first, second = cells("first"), cells("second")
+    run_id = open_sweep(tracker, first)
+    open_sweep(tracker, second)
+    for name in (run_id, run_id[:6]):
+        assert tracker.reader.read_sweep(name).planned == first
+    assert tracker.reader.read_sweep("heads (laptop)").planned == second
+    with pytest.raises(BadInputError, match="no sweep"):
+        tracker.reader.read_sweep(run_id[:5])  # too short to be sure
+
+
 def test_an_unknown_sweep_names_the_known_ones(tracker):
     open_sweep(tracker, cells("known"))
     with pytest.raises(BadInputError, match=r"no sweep 'haeds'.*heads \(laptop\)"):

@@ -299,7 +299,7 @@ def _better_driving(rules: Rules) -> str:
         f"The lower end of each difference's interval in driving score, at {100 * (1 - rules.alpha):g} %, lies above "
         f"0. It fails where the simultaneous interval excludes a gain of {rules.driving_margin:g} points of 100. "
         f"With one encoder for each cell the interval is widened by {rules.driving_allowance:g} points on either side "
-        "for other encoders, which is a guess."
+        "for other encoders."
     )
 
 

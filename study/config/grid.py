@@ -91,9 +91,7 @@ class Rules(Settings):
         10.0, description="true difference in driving score for which a finding's power is stated"
     )
     driving_allowance: NotNegative = Field(
-        5.0,
-        description="what two encoders may differ in driving score by their seeds alone, with one encoder for each "
-        "cell; a guess until several encoders of a head set have driven",
+        7.0, description="what two encoders may differ in driving score by their seeds alone, with one for each cell"
     )
     fixed: Fixed | None = Field(None, description="when these rules were last changed, and the commit that holds them")
 

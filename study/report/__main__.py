@@ -33,6 +33,9 @@ HINT = (
 def report(name: str, profile: str | None, kind: str, out: Path, tracking: str) -> int:
     """Write the report of SWEEP from what MLflow holds: PDF, figures, numbers and the tidy table.
 
+    SWEEP: its name, for the latest run of that name, or the first six or more characters of a run id, which
+    python -m study.sweep clean lists.
+
     With --format md, print the report without figures as Markdown; with --format latex, its tables for a paper. Exit
     code 1: the result of a finished cell is lost.
     """
@@ -62,7 +65,8 @@ def report(name: str, profile: str | None, kind: str, out: Path, tracking: str) 
 def compare(first: str, second: str, figure: Path | None, kind: str, tracking: str) -> int:
     """Set two sweeps side by side on stdout: as Markdown, or the tables alone as LaTeX.
 
-    A and B: each a report.json, a folder that holds one, or NAME[:PROFILE][@URI] of a sweep in MLflow.
+    A and B: each a report.json, a folder that holds one, or NAME[:PROFILE][@URI] of a sweep in MLflow, whose run id
+    may stand for its name.
     """
     text, code = resolve_name("study.report.build:side_by_side")(first, second, tracking, figure, kind)
     print(text, end="")

@@ -79,7 +79,7 @@ def typeset(
 def publish(tracker: Tracker, name: str, profile: str | None, folder: Path) -> tuple[Path, int]:
     """Build the report from the tracker alone, and add it to the sweep's run. Returns the PDF's path and exit code."""
     record = complete_cells(tracker.reader, name, profile)
-    pdf, files = build_report(record, folder), folder / name
+    pdf, files = build_report(record, folder), folder / record.grid.name
     tables = [files / name for name in ("report.json", "curves.parquet", DRIVES) if (files / name).exists()]
     tracker.log_files(record.run_id, [pdf, *tables], "report")
     tracker.log_files(record.run_id, sorted((files / "figures").glob("*")), "figures")

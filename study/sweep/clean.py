@@ -27,10 +27,9 @@ from study.sweep.locks import hold_store, store_folder
 from study.sweep.plan import look_up, study_name
 from study.tracking.cleaning import Deletion, StoredSweep, plan_deletion, shrink, stored_sweeps
 from study.tracking.experiment import TrackerLostError
-from study.tracking.reader import Reader
+from study.tracking.reader import Reader, is_named
 
 DAY = 86400.0  # [s]
-LEAST = 6  # characters of a run id that name a sweep
 UNKNOWN = "its plan cannot be read, or another version of this program has made it"
 
 
@@ -51,7 +50,7 @@ class Choice:
     def sweeps(self, stored: Sequence[StoredSweep], now: float) -> list[StoredSweep]:
         """Return the chosen sweeps at a time [s since 1970]. Raises BadInputError for a name that no sweep has."""
         for name in self.names:
-            if not any(_is_named(sweep, name) for sweep in stored):
+            if not any(is_named(sweep.run, name) for sweep in stored):
                 known = ", ".join(sorted({sweep.name for sweep in stored})) or "none"
                 raise BadInputError(f"no sweep '{name}' in this store; there are: {known}")
         if not self.names and self.older_than is None:
@@ -59,14 +58,10 @@ class Choice:
         return [
             sweep
             for sweep in stored
-            if (not self.names or any(_is_named(sweep, name) for name in self.names))
+            if (not self.names or any(is_named(sweep.run, name) for name in self.names))
             and self.profile in (None, sweep.profile)
             and now - sweep.used >= (self.older_than or 0.0) * DAY
         ]
-
-
-def _is_named(sweep: StoredSweep, name: str) -> bool:
-    return name in (sweep.name, sweep.title) or (len(name) >= LEAST and sweep.id.startswith(name))
 
 
 @dataclass(frozen=True)

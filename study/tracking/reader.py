@@ -33,6 +33,7 @@ DRIVES = PurePosixPath("drives/drives.parquet")  # artifact of a cell run whose 
 DRIVE_KEY = "drive_key"  # its tag, written last
 SWEEP_FILES = ("plan.json", "data.json", "provenance.json", "uncommitted.diff")  # artifacts of a sweep run
 PARENT = "mlflow.parentRunId"  # tag of a cell's run and of a seed's: the run above it
+LEAST = 6  # characters of a run id that name a sweep
 LIVES = 600.0  # [s] around a sign of life from another machine, whose clock may differ by minutes
 PERMANENT = "permanent"  # tag of a failed attempt: another try would not help
 
@@ -149,20 +150,20 @@ class Reader:
         return abs(time.time() - heard / 1000) < LIVES
 
     def sweeps_of(self, name: str, profile: str | None = None) -> list[str]:
-        """Return the run ids of the sweeps of that name, the latest first. Raises BadInputError when there is none."""
+        """Return the run ids of the sweeps that `is_named` so, the latest first. Raises BadInputError for none."""
         runs = self.sweep_runs()
         found = [
             str(run.info.run_id)
             for run in reversed(runs)
-            if run.data.tags.get("sweep") == name and profile in (None, run.data.tags.get("profile"))
+            if is_named(run, name) and profile in (None, run.data.tags.get("profile"))
         ]
         if found:
             return found
         wanted = f"{name} ({profile})" if profile else name
         names = ", ".join(sorted({str(run.info.run_name) for run in runs})) or "none yet"
         raise BadInputError(
-            f"no sweep '{wanted}' in {self.experiment.uri}; there are: {names}. Run it with: python -m study.sweep "
-            f"{name}"
+            f"no sweep '{wanted}' in {self.experiment.uri}; there are: {names}. Run it with python -m study.sweep, "
+            "or take a run id that python -m study.sweep clean lists"
         )
 
     def read_sweep(self, name: str, profile: str | None = None) -> SweepRecord:
@@ -256,6 +257,12 @@ class Reader:
                 f"sweep run {run_id} in {self.experiment.uri} was planned by another version of this program "
                 f"({error}); run the sweep again"
             ) from error
+
+
+def is_named(sweep_run: Run, name: str) -> bool:
+    """Return whether a sweep has this name, with or without its profile, or a run id that begins so."""
+    names = sweep_run.data.tags.get("sweep"), sweep_run.info.run_name
+    return name in names or (len(name) >= LEAST and sweep_run.info.run_id.startswith(name))
 
 
 def running_cells(sweep_run_id: str) -> str:
