@@ -167,6 +167,8 @@ def test_a_report_on_imported_drives_names_their_writer_and_not_our_town(incompl
     assert "imported drives, written by lab logger 3" in text
     assert "a town of our own" not in text
     assert "frames.balance" in text
+    assert "heads-balance-steering --profile laptop --data DIR" in text
+    assert "heads-brake-hold-0" not in text, "their writer has no such setting"
     assert not re.search(r"(town|recording|driving)\.[a-z_]+ ", text), "settings that imported drives do not have"
     assert "make heads" not in text, "it would make another report"
 
@@ -304,9 +306,10 @@ def test_a_sweep_that_varies_one_setting_is_found_and_takes_nobodys_place(tracke
         new = f"v{key[1:]}"
         tracker.commit(tracker.start_cell(run, planned[new], new, settings, 3), replace(result, key=new))
     tracker.close_sweep(run, "FINISHED")
-    assert {name: one.grid.name for name, one in with_variants(tracker.reader, record).variants.items()} == {
-        "frames.split": "pair-split"
-    }
+    imported = {"writers": ["lab logger 3"], "sources": {"encoder": [{"name": "a", "digest": "d"}]}}
+    for data, found in (({}, {"frames.split": "pair-split"}), (imported, {})):  # nothing is like another lab's drives
+        variants = with_variants(tracker.reader, replace(record, data=record.data | data)).variants
+        assert {name: one.grid.name for name, one in variants.items()} == found
     back = with_variants(tracker.reader, tracker.reader.read_sweep("pair-split")).variants
     assert {name: one.grid.name for name, one in back.items()} == {"frames.split": "pair"}
     assert tracker.reader.read_sweep("pair").settings == record.settings

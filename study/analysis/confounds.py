@@ -119,9 +119,13 @@ class ContrastChange:
 
 
 def concerned(record: SweepRecord) -> list[Confound]:
-    """Return the confounds that this kind of sweep has."""
-    several = len(record.grid.fractions) > 1
-    return [confound for confound in CONFOUNDS if confound.fractions == several]
+    """Return the confounds that this kind of sweep has. Imported drives have none of our town's."""
+    several, imported = len(record.grid.fractions) > 1, bool(record.data.get("writers"))
+    return [
+        confound
+        for confound in CONFOUNDS
+        if confound.fractions == several and not (imported and confound.setting.startswith("town."))
+    ]
 
 
 def varied(one: StudySettings, other: StudySettings) -> Confound | None:

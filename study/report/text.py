@@ -76,8 +76,9 @@ def _lists(report: Report) -> dict[str, Any]:
     sweep = report.sweep
     ends = [row for row in report.scores if row.fraction in (sweep.fractions[0], sweep.fractions[-1])]
     over = (f"{row.n} policies on {'one encoder' if row.encoders == 1 else f'{row.encoders} encoders'}" for row in ends)
+    run = f"--profile {sweep.profile}{' --data DIR' if sweep.imported else ''}"
     unseen = (
-        f"{code(row.setting)}, by {code(f'python -m study.sweep {row.sweep} --profile {sweep.profile}')}"
+        f"{code(row.setting)}, by {code(f'python -m study.sweep {row.sweep} {run}')}"
         for row in report.confounds
         if not row.contrasts
     )

@@ -14,6 +14,7 @@ from study.tracking.reader import Reader
 def with_variants(reader: Reader, record: SweepRecord) -> SweepRecord:
     """Return a sweep with, by setting, the latest one of its profile that differs from it in that confound alone.
 
+    Settings do not say where drives come from: those of a study on imported drives may be our town's.
     Sweeps that cannot be read are named in `unread` and left out.
     """
     variants: dict[str, SweepRecord] = {}
@@ -34,6 +35,12 @@ def with_variants(reader: Reader, record: SweepRecord) -> SweepRecord:
         except BadInputError:  # planned by another version: nothing to compare with
             continue
         unread += [f"sweep {run.info.run_name}, to compare with: {line}" for line in variant.unread]
-        if contrasts(record, variant, confound):
+        if _imported(variant) == _imported(record) and contrasts(record, variant, confound):
             variants[confound.setting] = variant
     return replace(record, variants=variants, unread=tuple(dict.fromkeys(unread)))
+
+
+def _imported(record: SweepRecord) -> set[str]:
+    """Return the digests of imported drives; nothing for our town's, which the settings define."""
+    sources = record.data.get("sources", {}) if record.data.get("writers") else {}
+    return {drive["digest"] for drives in sources.values() for drive in drives}
