@@ -353,10 +353,16 @@ def test_a_probe_finds_what_a_latent_holds_and_nothing_where_there_is_nothing():
     rng = np.random.default_rng(0)
     z, drive = rng.normal(size=(800, 64)).astype(np.float32), np.arange(800) // 40
     held = z[:, 3] * 2.0 + 5
-    assert predictions.probe(z, held, drive) > 0.95
-    assert predictions.probe(z, rng.normal(size=800), drive) < 0.05
-    assert math.isnan(predictions.probe(z, np.ones(800), drive))
-    assert math.isnan(predictions.probe(z, held, np.zeros(800, int)))
+    targets = np.column_stack([held, rng.normal(size=800), np.ones(800)])
+    found, nothing, constant = predictions.probe(z, targets, drive)
+    assert found > 0.95
+    assert nothing < 0.05
+    assert math.isnan(constant)
+    assert np.isnan(predictions.probe(z, targets, np.zeros(800, int))).all()
+    targets[::2, 1] = np.nan
+    assert np.array_equal(
+        predictions.probe(z, targets, drive), predictions.probe(z[1::2], targets[1::2], drive[1::2]), equal_nan=True
+    )
 
 
 def test_a_probe_is_scikit_learns_ridge_on_held_out_drives():
@@ -370,7 +376,9 @@ def test_a_probe_is_scikit_learns_ridge_on_held_out_drives():
         fit = linear_model.Ridge(alpha=1.0).fit(x[~test], target[~test])
         error += ((target[test] - fit.predict(x[test])) ** 2).sum()
         total += ((target[test] - target[~test].mean()) ** 2).sum()
-    assert predictions.probe(z, target, drive) == pytest.approx(1 - error / total, rel=1e-4)
+    further = rng.normal(size=300)  # what else is asked for makes no difference
+    found, _ = predictions.probe(z, np.column_stack([target, further]), drive)
+    assert found == pytest.approx(1 - error / total, rel=1e-4)
 
 
 def test_a_probe_does_not_profit_from_twins_in_the_same_drive():
@@ -378,7 +386,8 @@ def test_a_probe_does_not_profit_from_twins_in_the_same_drive():
     drive = np.arange(800) // 40
     own = rng.normal(size=(20, 64))
     z = (own[drive] + 0.01 * rng.normal(size=(800, 64))).astype(np.float32)  # a latent tells the drive, nothing else
-    assert predictions.probe(z, rng.normal(size=20)[drive], drive) < 0.3
+    (found,) = predictions.probe(z, rng.normal(size=20)[drive][:, None], drive)
+    assert found < 0.3
 
 
 def test_principal_components_are_those_of_the_covariance():

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
@@ -20,6 +18,7 @@ from study.config.paper import ACCELERATIONS
 from study.randomness import rng
 
 CLASSES = range(len(ACCELERATIONS))
+TINY = np.finfo(np.float64).tiny
 
 
 def steering_floor(labels: Array) -> float:
@@ -45,22 +44,23 @@ def episode_accuracy(predicted: NDArray[np.uint8], label: NDArray[np.uint8], epi
     return pd.Series((predicted == label).mean(axis=0)).groupby(episode).mean()
 
 
-def probe(z: NDArray[np.float32], target: Array, drive: NDArray[np.int32], folds: int = 5) -> float:
-    """Return the share of a target's variance that ridge regression on latents explains in drives not seen (R2).
+def probe(z: NDArray[np.float32], targets: Array, drive: NDArray[np.int32], folds: int = 5) -> Array:
+    """Return the share of each target's variance that ridge regression on latents explains in drives not seen (R2).
 
-    z [N, 64]; target [N], NaN where there is none; whole drives are held out in turn. NaN where fewer than `folds`
-    drives have the target, or it does not vary.
+    z [N, 64]; targets [N, T], where rows with a NaN are left out; whole drives are held out in turn. NaN where fewer
+    than `folds` drives have targets, or where a target does not vary.
     """
-    known = np.isfinite(target)
-    y, group = target[known], drive[known]
+    known = np.isfinite(targets).all(axis=1)
+    y, group = targets[known].astype(np.float64), drive[known]
     names = np.unique(group)
-    if len(names) < folds or np.ptp(y) == 0:
-        return math.nan
+    if len(names) < folds:
+        return np.full(targets.shape[1], np.nan)
     x = StandardScaler().fit_transform(z[known].astype(np.float64))
     tests = [np.isin(group, held) for held in np.array_split(rng(0, "probe").permutation(names), folds)]
     splits = [(np.flatnonzero(~test), np.flatnonzero(test)) for test in tests]
-    guess, mean = (cross_val_predict(model, x, y, cv=splits) for model in (Ridge(), DummyRegressor()))
-    return float(1 - ((y - guess) ** 2).sum() / ((y - mean) ** 2).sum())
+    guess, mean = (cross_val_predict(model, x, y, cv=splits).reshape(y.shape) for model in (Ridge(), DummyRegressor()))
+    explained = 1 - ((y - guess) ** 2).sum(axis=0) / np.maximum(((y - mean) ** 2).sum(axis=0), TINY)
+    return np.where(np.ptp(y, axis=0) > 0, explained, np.nan)
 
 
 def principal(z: NDArray[np.float32]) -> tuple[Array, Array]:
