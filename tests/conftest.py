@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 
 ROOT = Path(__file__).parent.parent
 MEMORY = Path("/dev/shm")  # noqa: S108 - pytest makes a folder of the user's own there
@@ -87,5 +88,8 @@ def empty_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def undisturbed(empty_store: Path, tmp_path_factory: pytest.TempPathFactory) -> UndisturbedSweep:
-    """Return a finished sweep of four cells, to copy and to compare with."""
-    return UndisturbedSweep.run(tmp_path_factory.mktemp("undisturbed"), empty_store)
+    """Return a finished sweep of four cells, to copy and to compare with; processes that test side by side share it."""
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "undisturbed"
+    with FileLock(f"{folder}.lock"):
+        return UndisturbedSweep.run(folder, empty_store)
