@@ -100,9 +100,10 @@ class _Window:
     def affines(self, x: Floats, y: Floats, heading: Floats) -> Floats:
         """Return the maps from the world [m] to pixel centres [M, 2, 3] for egos [M]; they look up."""
         east, north = self.scale * np.cos(heading), self.scale * np.sin(heading)
-        column = np.stack([north, -east, self.column - 0.5 - north * x + east * y], axis=1)
-        row = np.stack([-east, -north, self.row - 0.5 + east * x + north * y], axis=1)
-        return np.stack([column, row], axis=1)
+        affines = np.empty((len(x), 2, 3))
+        affines[:, 0, 0], affines[:, 0, 1], affines[:, 0, 2] = north, -east, self.column - 0.5 - north * x + east * y
+        affines[:, 1, 0], affines[:, 1, 1], affines[:, 1, 2] = -east, -north, self.row - 0.5 + east * x + north * y
+        return affines
 
 
 class Renderer:
@@ -201,7 +202,8 @@ class Renderer:
                         cv2.fillConvexPoly(flat, polygon, _MASK, cv2.LINE_8, FRACTION_BITS)
                     grey[index, mask] = _shrink(flat)
             start = plan
-        masks[:] = np.packbits((grey >= _MASK // 2).reshape(*masks.shape[:2], IMAGE * IMAGE), axis=2)
+        if self._targets:
+            masks[:] = np.packbits((grey >= _MASK // 2).reshape(*masks.shape[:2], IMAGE * IMAGE), axis=2)
 
     def _boxes(
         self, moments: Moments, affines: Floats, heading: Floats
@@ -215,7 +217,7 @@ class Renderer:
         offsets = np.arange(-history, self.settings.future + 1 if self._targets else 1)  # an image shows no future
         steps = moments[:, :1] + offsets
         inside = (steps >= 0) & (steps < episode.steps)
-        steps = steps.clip(0, episode.steps - 1)
+        steps = np.minimum(np.maximum(steps, 0), episode.steps - 1)
         # Cull around the centre of the view in float32: cheap, and a metre of margin covers its rounding.
         centre = np.array([size / 2, size / 2]) - affines[:, :, 2]
         middle = (np.einsum("mij,mi->mj", affines[:, :, :2], centre) / scale**2).astype(np.float32)
@@ -250,7 +252,7 @@ class Renderer:
         number = np.full((len(moments), len(offsets) + 1, near.shape[2]), -1)
         number[frame, pose, agent] = np.arange(len(frame))
         younger = number[frame, pose + 1, agent]
-        hidden = (younger >= 0) & (pose != history) & (fixed == fixed[younger]).all(axis=(1, 2))
+        hidden = (younger >= 0) & (pose != history) & (fixed == fixed[younger]).reshape(-1, 8).all(axis=1)
         is_ego = agent == moments[frame, 1]
         layer = np.where(pose <= history, 0, 2) + is_ego  # others' past, ego's past, pred, plan
         order = np.lexsort((pose, layer, frame))

@@ -67,8 +67,7 @@ class Fleet:
         self.ends = np.zeros(vehicles)  # of the planned route
         self.sampled = np.zeros(vehicles, np.int64)  # strips of the route that `x` and so on hold
         self.x, self.y, self.heading, self.curvature = np.zeros((4, vehicles, SAMPLES))
-        self.first = np.zeros(vehicles, np.int64)  # number along the route of the first sample kept
-        self.filled = np.zeros(vehicles, np.int64)  # samples kept
+        self.first, self.filled = np.zeros((2, vehicles), np.int64)  # first sample kept, by its number; samples kept
         self.s = np.zeros(vehicles)
         self.lateral = np.zeros(vehicles)
         self.at = np.zeros(vehicles, np.int64)  # position in `routes` of the strip that the vehicle is on
@@ -182,8 +181,9 @@ class Fleet:
         """Locate every vehicle on its planned path, and plan ahead."""
         rows = np.arange(len(x))
         near = (self.s / SPACING).astype(np.int64) - self.first
-        window = (near[:, None] + np.arange(-3, 7)).clip(0)
-        dx, dy = x[:, None] - self.x[rows[:, None], window], y[:, None] - self.y[rows[:, None], window]
+        window = np.maximum(near[:, None] + np.arange(-3, 7), 0)
+        place = (rows * SAMPLES)[:, None] + window
+        dx, dy = x[:, None] - self.x.take(place), y[:, None] - self.y.take(place)
         best = (dx * dx + dy * dy).argmin(axis=1)
         k = window[rows, best]
         dx, dy, heading = dx[rows, best], dy[rows, best], self.heading[rows, k]
@@ -287,8 +287,8 @@ class Fleet:
         middle = near + round(17 / SPACING)
         close = np.hypot(x[j] - self.x[rows, middle][i], y[j] - self.y[rows, middle][i]) < 20.5
         i, j = i[close], j[close]
-        window = near[:, None] + np.arange(2, round((LOOK + LENGTH / 2 + 2) / SPACING), 2)
-        px, py = self.x[rows[:, None], window], self.y[rows[:, None], window]
+        window = (rows * SAMPLES + near)[:, None] + np.arange(2, round((LOOK + LENGTH / 2 + 2) / SPACING), 2)
+        px, py = self.x.take(window), self.y.take(window)
         dx, dy = px[i] - x[j][:, None], py[i] - y[j][:, None]
         met = ((dx * dx + dy * dy).min(axis=1) < (LENGTH / 2 + WIDTH) ** 2).nonzero()[0]  # beyond, no sample is a hit
         i, j, dx, dy = i[met], j[met], dx[met], dy[met]
@@ -303,11 +303,11 @@ class Fleet:
         pair = np.arange(len(i))
         before, after = away[pair, np.maximum(k - 1, 0)], away[pair, k]
         part = np.where(k > 0, (before - width) / np.maximum(before - after, 1e-9), 1.0)
-        where = window[i, k] + 2 * (part - 1) + self.first[i]
+        where = near[i] + 2 * (k + 1) + 2 * (part - 1) + self.first[i]
         distance = where * SPACING - self.s[i] + width - LENGTH / 2
         order = np.lexsort((distance, i))
         i, j, distance = i[order], j[order], distance[order]
-        nearest = np.diff(i, prepend=-1) > 0
+        nearest = np.concatenate([i[:1] >= 0, i[1:] != i[:-1]])
         gap, lead = np.full(len(x), np.inf), np.full(len(x), -1)
         gap[i[nearest]], lead[i[nearest]] = distance[nearest], j[nearest]
         gap[gap > LOOK] = np.inf
