@@ -217,7 +217,7 @@ class Renderer:
         offsets = np.arange(-history, self.settings.future + 1 if self._targets else 1)  # an image shows no future
         steps = moments[:, :1] + offsets
         inside = (steps >= 0) & (steps < episode.steps)
-        steps = np.minimum(np.maximum(steps, 0), episode.steps - 1)
+        steps = np.minimum(np.maximum(steps, 0), episode.steps - 1)  # `clip` takes far longer for so few
         # Cull around the centre of the view in float32: cheap, and a metre of margin covers its rounding.
         centre = np.array([size / 2, size / 2]) - affines[:, :, 2]
         middle = (np.einsum("mij,mi->mj", affines[:, :, :2], centre) / scale**2).astype(np.float32)

