@@ -1,7 +1,6 @@
 #!/bin/sh
 # Make a SUMO town of five by five signalised crossings, run it 160 times, and study it: `sh examples/sumo_town.sh`.
-# Needs `pip install 'study[sumo]'`. reports/reference/heads-sumo came from these commands, the last with
-# --encoder.epochs 5.
+# Needs `pip install 'study[sumo]'`. reports/reference/heads-sumo came from these commands.
 set -e
 tools=$(python -c "import pathlib, sumo; print(pathlib.Path(sumo.SUMO_HOME) / 'tools')")
 mkdir -p sumo-town
