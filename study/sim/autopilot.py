@@ -16,7 +16,7 @@ from study.config.paper import ACCELERATIONS
 from study.config.settings import DynamicsSettings
 from study.episode.schema import GREEN, RED, YELLOW
 from study.sim.dynamics import BRAKE, DT, LOOK, stopping_distance
-from study.sim.geometry import LENGTH, WIDTH, Floats, Ints, Pose, true_pairs
+from study.sim.geometry import LENGTH, WIDTH, Floats, Ints, Pose, true_pairs, within
 from study.sim.town import Town
 
 REACH = LOOK + 8.0  # distance between centres within which lie all vehicles of the look-ahead [m]
@@ -89,6 +89,7 @@ class Fleet:
         self.move_length = np.array([move.length for move in moves])
         self.street_length = np.array([strip.piece.length for strip in town.strips])
         self.load = np.zeros(len(town.strips))  # vehicles that are on a strip or plan to use it
+        self.meets = ~np.isnan(town.enter)  # whether two movements obstruct each other
         across = np.where(town.opposing, town.enter, np.inf)
         self.first_crossing = np.nan_to_num(across, nan=np.inf).min(axis=1, initial=np.inf)
 
@@ -271,12 +272,11 @@ class Fleet:
             aslant = heading + now - self.ahead(self.heading, np.zeros(len(speed)))
             lateral = lateral + lag * speed * np.sin(aslant)
             heading = heading + lag * speed * np.sin(now) / (LENGTH / 2)
-        aside = np.arcsin((-KP_LATERAL * lateral / v).clip(-1, 1)).clip(-np.pi / 4, np.pi / 4)
+        aside = within(np.arcsin(within(-KP_LATERAL * lateral / v, 1)), np.pi / 4)
         error = np.mod(course + aside - heading + np.pi, 2 * np.pi) - np.pi
         rate = v * curvature + KP_HEADING * error
-        slip = np.arcsin((LENGTH / 2 / v * rate).clip(-1, 1))
-        command: Floats = np.arctan(2 * np.tan(slip)).clip(-MOST_STEERING, MOST_STEERING)
-        return command
+        slip = np.arcsin(within(LENGTH / 2 / v * rate, 1))
+        return within(np.arctan(2 * np.tan(slip)), MOST_STEERING)
 
     def _lead(self, pose: Pose, pairs: tuple[Ints, Ints]) -> tuple[Floats, Ints]:
         """Return the free way before each bumper [m], inf beyond LOOK, and the vehicle that ends it, -1 for none."""
@@ -339,8 +339,7 @@ class Fleet:
         goes = inside | self.running | ((state == GREEN) & ~self.held)
         waits = (self.move >= 0) & (front > -45)
         one, other = waits.nonzero()[0], (waits & goes).nonzero()[0]
-        table = town.enter[self.move[one][:, None], self.move[other][None]]
-        rows, columns = true_pairs(~np.isnan(table))
+        rows, columns = true_pairs(self.meets[self.move[one]].take(self.move[other], axis=1))
         i, j = one[rows], other[columns]
         a, b = self.move[i], self.move[j]
         into_i, out_i, into_j, out_j = town.enter[a, b], town.leave[a, b], town.enter[b, a], town.leave[b, a]

@@ -91,6 +91,11 @@ def connect_poses(start: tuple[float, float, float], end: tuple[float, float, fl
     return pieces
 
 
+def within(values: Floats, most: float) -> Floats:
+    """Return values, cut at -`most` and `most`: `clip`, which takes four times as long for a hundred."""
+    return np.minimum(np.maximum(values, -most), most)
+
+
 def true_pairs(table: NDArray[np.bool_]) -> tuple[Ints, Ints]:
     """Return rows and columns of what is true in a table, in its order: `np.nonzero`, five times faster."""
     rows, columns = np.divmod(table.ravel().nonzero()[0], table.shape[1])
