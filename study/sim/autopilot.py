@@ -67,7 +67,7 @@ class Fleet:
         self.ends = np.zeros(vehicles)  # of the planned route
         self.sampled = np.zeros(vehicles, np.int64)  # strips of the route that `x` and so on hold
         self.x, self.y, self.heading, self.curvature = np.zeros((4, vehicles, SAMPLES))
-        self.first, self.filled = np.zeros((2, vehicles), np.int64)  # first sample kept, by its number; samples kept
+        self.first, self.filled = np.zeros((2, vehicles), np.int64)  # number of the first sample kept; how many are
         self.s = np.zeros(vehicles)
         self.lateral = np.zeros(vehicles)
         self.at = np.zeros(vehicles, np.int64)  # position in `routes` of the strip that the vehicle is on

@@ -138,7 +138,7 @@ class Traffic(TownRoad):
                 vehicle.act({"acceleration": force_now, "steering": wheel_now})
 
     def near_pairs(self) -> tuple[Ints, Ints]:
-        """Return what `TownRoad.near_pairs` does; those of the decision reach farther than a vehicle moves."""
+        """Return at least the pairs that may touch: those of the decision, if it is of this step, reach far enough."""
         return self.decided_pairs if self.decided == self.steps else super().near_pairs()
 
     def controls(self) -> tuple[Pose, Floats, Floats]:
