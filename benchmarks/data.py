@@ -27,12 +27,12 @@ from typing import Any
 import cv2
 import numpy as np
 
+from study.birdview.renderer import Renderer, valid_moments
 from study.compute.provenance import ROOT, provenance
 from study.config.files import load_profile
 from study.config.keys import frames_key
 from study.config.paper import IMAGE
 from study.config.settings import StudySettings
-from study.data.birdview import Renderer, valid_moments
 from study.episode.files import read_episode, write_episode
 from study.sim.dynamics import DT
 from study.sim.env import Traffic, make_traffic

@@ -37,9 +37,9 @@ from study.data.prepare import data_flow
 from study.engine.dask_engine import DaskEngine
 from study.engine.flows import run_flow
 from study.engine.local import local_engine
+from study.planning.plan import Plan, cell_jobs, make_plan
 from study.results.cell_result import CellResult
 from study.stages import ENCODER, POLICY, RESULT, Batch, Flow, Task, cell_cost
-from study.sweep.plan import Plan, cell_jobs, make_plan
 
 RESULT_FILE = Path(__file__).parent / "results" / "engine.json"
 WORKERS = 2

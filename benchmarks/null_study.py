@@ -15,12 +15,13 @@ import itertools
 
 import pandas as pd
 
-from study.analysis import claims, effects, learning_curves
-from study.analysis.drives import DriveScores, by_drive
-from study.analysis.learning_curves import ACCURACY, STEERING, Panel, Point
+from study.analysis import claims
 from study.config.files import load_grid
 from study.config.heads import HEAD_SETS
 from study.config.workspace import HERE
+from study.statistics import effects, learning_curves
+from study.statistics.drives import DriveScores, by_drive
+from study.statistics.learning_curves import ACCURACY, STEERING, Panel, Point
 from study.tracking.tracker import Tracker
 
 

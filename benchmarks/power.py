@@ -23,12 +23,13 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy import signal
 
-from study.analysis import claims, effects
+from study.analysis import claims
 from study.analysis.claims import CLAIMS, Evidence
-from study.analysis.drives import DriveScores
-from study.analysis.learning_curves import ACCURACY, STEERING, Point
 from study.config.grid import Grid, Rules
 from study.config.heads import HEAD_SETS
+from study.statistics import effects
+from study.statistics.drives import DriveScores
+from study.statistics.learning_curves import ACCURACY, STEERING, Point
 
 Array = NDArray[np.float64]
 RESULT = Path(__file__).with_name("results") / "power.json"

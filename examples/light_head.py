@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from study.birdview.targets import Moment, Polygon
 from study.config.heads import Head, HeadSet
-from study.data.targets import Moment, Polygon
 from study.episode.schema import GREEN
 
 DEPTH = 2.0  # [m] along the road, of what is painted at a stop line

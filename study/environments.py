@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
+from study.birdview.scene import Scene
 from study.config.paper import ACCELERATIONS, IMAGE, LATENT
 from study.config.settings import StudySettings
 from study.config.workspace import HERE
-from study.data.scene import Scene
 from study.driving.drives import Drive
 from study.driving.ride import Ride
 from study.encoder.inputs import to_float

@@ -32,6 +32,7 @@ SANDBOX = Path(tempfile.mkdtemp(prefix="study-tests-", dir=os.environ.get("PYTES
 for name in [name for name in os.environ if name.startswith(("XDG_", "MPL", "MLFLOW_", "GIT_"))]:
     del os.environ[name]
 os.environ |= {"HOME": str(SANDBOX), "PYTHONPATH": str(ROOT)}
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # a hundred programs start: each would compile the study again
 
 # Tests that run side by side use one core each: threads that wait actively for each other take ten times as long.
 if "PYTEST_XDIST_WORKER" in os.environ:

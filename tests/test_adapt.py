@@ -8,20 +8,20 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from study.birdview.renderer import valid_moments
 from study.config.files import load_profile
 from study.config.settings import FramesSettings
-from study.data.birdview import valid_moments
 from study.data.frames import open_frames
 from study.data.prepare import data_flow
 from study.engine.flows import run_flow
-from study.episode.adapt import STEERING_UNIT, adapt, derived_commands
 from study.episode.files import read_episode, write_episode
 from study.episode.head import file_digest
-from study.episode.imported import open_import
-from study.episode.importing import import_drives
 from study.errors import BadInputError
+from study.intake.adapt import STEERING_UNIT, adapt, derived_commands
+from study.intake.imported import open_import
+from study.intake.importing import import_drives
+from study.planning.plan import make_plan
 from study.sim.record import record_episode
-from study.sweep.plan import make_plan
 from tests.support.drives import crossing_drive, write_drives
 
 

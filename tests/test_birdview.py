@@ -6,10 +6,10 @@ import hashlib
 import numpy as np
 import pytest
 
+from study.birdview import renderer as birdview
+from study.birdview.renderer import Renderer, governing_light, valid_moments
 from study.config.keys import FORMAT_VERSIONS
 from study.config.settings import BirdviewSettings
-from study.data import birdview
-from study.data.birdview import Renderer, governing_light, valid_moments
 from study.episode.checks import check_episode
 from study.episode.schema import GREEN, RED, YELLOW, Agent, Episode, Lane, Light, empty_states
 from study.errors import BadInputError

@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from study.birdview.renderer import MASK_BYTES
 from study.config.settings import BirdviewSettings
-from study.data.birdview import MASK_BYTES
 from study.data.card import _others, _twins, card_files, card_text, make_card, nearest_frames, thumbnails, write_card
 from study.data.frames import Frames, open_frames
 from study.episode.files import read_episode

@@ -3,11 +3,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from study.analysis import claims, drives, effects, learned, learning_curves
-from study.analysis.learning_curves import ACCURACY, KEYFRAME, STEERING
+from study.analysis import claims, learned
 from study.config.grid import Grid, Rules
 from study.config.heads import HEAD_SETS
 from study.config.settings import StudySettings
+from study.statistics import drives, effects, learning_curves
+from study.statistics.learning_curves import ACCURACY, KEYFRAME, STEERING
 from tests.support.synthetic_records import DATASIZE_GRID, HEADS_GRID, World, simulate
 
 LONG = StudySettings.model_validate({"encoder": {"epochs": 120}})  # 1,200 steps at the smallest fraction

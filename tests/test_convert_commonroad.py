@@ -5,9 +5,9 @@ import pytest
 
 from study.convert.commonroad import convert
 from study.episode.files import read_episode
-from study.episode.importing import check_drives
 from study.episode.schema import GREEN, RED, YELLOW
 from study.errors import BadInputError
+from study.intake.importing import check_drives
 
 pytest.importorskip("commonroad", reason="commonroad-io is not installed")
 STEPS = 80

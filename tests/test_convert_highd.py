@@ -8,8 +8,8 @@ from study.convert.highd import convert
 from study.convert.lanelet2 import utm
 from study.data.__main__ import main
 from study.episode.files import read_episode
-from study.episode.importing import check_drives
 from study.errors import BadInputError
+from study.intake.importing import check_drives
 
 FRAMES, RATE = 150, 25.0
 SECONDS = np.arange(FRAMES) / RATE

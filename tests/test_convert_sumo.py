@@ -12,9 +12,9 @@ from study.convert.sumo_net import read_net
 from study.convert.sumo_trace import read_fcd
 from study.data.__main__ import main
 from study.episode.files import read_episode
-from study.episode.importing import check_drives, import_drives
 from study.episode.schema import GREEN, RED, YELLOW
 from study.errors import BadInputError
+from study.intake.importing import check_drives, import_drives
 from tests.support.processes import sweep
 from tests.support.sumo import NET, SPEED, write_fcd, write_net
 from tests.support.sweeps import working_folder

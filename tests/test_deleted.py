@@ -6,9 +6,9 @@ from dataclasses import replace
 import pytest
 
 from study.engine.tasks import Failure
+from study.planning.options import RunOptions
+from study.planning.plan import plan_display
 from study.sweep.committing import Committing
-from study.sweep.options import RunOptions
-from study.sweep.plan import plan_display
 from study.tracking.experiment import SQLITE, DeletedError
 from study.tracking.tracker import Tracker
 from tests.support.plans import plan_of

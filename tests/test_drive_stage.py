@@ -14,14 +14,15 @@ from study.config.keys import drive_key
 from study.config.settings import StudySettings
 from study.driving.drives import planned_drives
 from study.engine.flows import run_flow
+from study.planning.plan import Plan, cell_jobs, make_plan
 from study.results.cell_result import CellResult
 from study.results.drives import EXPERT, WAY, means
 from study.stages import Flow
-from study.sweep.plan import Plan, cell_jobs, make_plan
+from study.sweep.__main__ import main
 from study.tracking.driven import commit_drives
 from study.tracking.reader import Reader
 from study.tracking.tracker import Tracker
-from tests.support.processes import CommandProcess, sweep_command
+from tests.support.processes import sweep
 from tests.support.sweeps import FOUR_CELLS, UndisturbedSweep
 
 
@@ -155,19 +156,22 @@ def test_committing_twice_doubles_nothing(plan: Plan, reader: Reader, key: str, 
     assert tracker.client.get_metric_history(run, "drive/driving_score") == before
 
 
-def test_a_finished_sweep_drives_when_it_is_told_to(undisturbed: UndisturbedSweep, tmp_path: Path) -> None:
+def test_a_finished_sweep_drives_when_it_is_told_to(
+    undisturbed: UndisturbedSweep, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder = undisturbed.copy(tmp_path / "work")
-    without = CommandProcess(folder, *sweep_command(*FOUR_CELLS, "--heads", "rec", "--drive", "false"))
-    assert without.wait() == 0, without.output
-    assert "driving" not in without.output
-    looked = CommandProcess(folder, *sweep_command(*FOUR_CELLS, "--heads", "rec", "--dry-run"))
-    assert looked.wait() == 0
-    assert "1 of 1 cells to drive" in looked.output
-    driving = CommandProcess(folder, *sweep_command(*FOUR_CELLS, "--heads", "rec"))
-    assert driving.wait() == 0, driving.output
-    assert "encoder" not in driving.output
-    assert "driving: 0 of 1 cells" in driving.output
-    status = CommandProcess(folder, *sweep_command("status", *FOUR_CELLS, "--heads", "rec"))
-    assert status.wait() == 0
-    assert "1 of 1 cells finished" in status.output
-    assert "have driven" not in status.output
+    monkeypatch.chdir(folder)
+    words = (*FOUR_CELLS, "--heads", "rec", "--workers", "1")
+    without = sweep(folder, *words, "--no-report", "--drive", "false")
+    assert without.returncode == 0, without.stderr
+    assert "driving" not in without.stderr
+    assert main([*words, "--dry-run"]) == 0
+    assert "1 of 1 cells to drive" in capsys.readouterr().out
+    driving = sweep(folder, *words, "--no-report")
+    assert driving.returncode == 0, driving.stderr
+    assert "encoder" not in driving.stderr
+    assert "driving: 0 of 1 cells" in driving.stderr
+    assert main(["status", *words]) == 0
+    status = capsys.readouterr().out
+    assert "1 of 1 cells finished" in status
+    assert "have driven" not in status

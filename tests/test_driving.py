@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from study.analysis.comfort import comfortable
-from study.analysis.proportions import wilson_interval
+from study.birdview.renderer import Image, Renderer
 from study.config.paper import ACCELERATIONS, STEERING_CROP
 from study.config.settings import BirdviewSettings, DrivingSettings, RecordingSettings, StudySettings, TownSettings
-from study.data.birdview import Image, Renderer
 from study.data.prepare import POLICY_SEED
 from study.driving.actors import (
     Expert,
@@ -34,6 +33,7 @@ from study.errors import BadInputError
 from study.policy.latents import normalisation
 from study.policy.networks import slots
 from study.randomness import rng
+from study.statistics.proportions import wilson_interval
 
 SETTINGS = StudySettings(
     town=TownSettings(rows=3, columns=3, dropped_edges=0, vehicles=20), recording=RecordingSettings(warm_up=3.0)

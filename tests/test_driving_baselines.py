@@ -12,6 +12,7 @@ import pytest
 from examples.speed_baseline import BASELINES as OWN
 from study.baselines import supervised
 from study.baselines.inputs import BaselineInputs
+from study.birdview.renderer import Renderer
 from study.cell.flow import cell_flow
 from study.cell.job import CellJob
 from study.config.baselines import BASELINES, SUPERVISED, Baseline
@@ -19,7 +20,6 @@ from study.config.files import load_profile
 from study.config.grid import Cell
 from study.config.keys import cell_key
 from study.config.settings import FramesSettings, RecordingSettings, StudySettings, TownSettings
-from study.data.birdview import Renderer
 from study.data.frames import FrameStore, open_frames
 from study.data.selection import LABELS, candidates
 from study.driving.actors import Commands, Expert

@@ -11,8 +11,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from safetensors.numpy import save_file
 
+from study.birdview.renderer import Renderer
 from study.config.settings import DrivingSettings, RecordingSettings, StudySettings, TownSettings
-from study.data.birdview import Renderer
 from study.encoder.latents import encode
 from study.encoder.networks import untrained_encoder
 from study.environments import BirdviewTownEnv, latent_town

@@ -21,7 +21,7 @@ def test_foreign_drives_end_in_a_report(tmp_path: Path) -> None:
     working_folder(tmp_path)
     for command in ([str(EXAMPLE), "ring"], ["-m", "study.data", "import", "ring", "--out", "mine"]):
         subprocess.run([sys.executable, *command], cwd=tmp_path, check=True, capture_output=True)
-    words = ("heads", "--profile", "tiny", "--policy_seeds", "2", "--heads", "[rec,full]", "--workers", "2")
+    words = ("heads", "--profile", "tiny", "--policy_seeds", "2", "--heads", "[rec,full]", "--workers", "1")
     words += ("--baselines", "[trail-pca,state]")
     completed = sweep(tmp_path, *words, "--data", "mine")
     assert completed.returncode == 0, completed.stderr

@@ -11,10 +11,10 @@ import pandas as pd
 import pytest
 from pypdf import PdfReader
 
+from study.birdview.renderer import Renderer, valid_moments
 from study.config.grid import Grid
 from study.config.heads import HEAD_SETS, HEADS
 from study.config.settings import BirdviewSettings
-from study.data.birdview import Renderer, valid_moments
 from study.data.frames import unpack_masks
 from study.errors import BadInputError
 from tests.support.drives import crossing_drive
@@ -38,10 +38,18 @@ def test_a_sweep_with_the_example_ends_with_its_report(tmp_path: Path) -> None:
     working_folder(tmp_path)
     shutil.copy(ROOT / "examples/light.yaml", tmp_path / "sweeps")
     words = ("light", "--profile", "tiny", "--policy_seeds", "2", "--baselines", "[speed]")
-    completed = sweep(tmp_path, *words, "--heads", "[rec,rec+light]", "--workers", "2")
+    completed = sweep(tmp_path, *words, "--heads", "[rec,rec+light]", "--workers", "1")
     assert completed.returncode == 0, completed.stderr
-    report = [sys.executable, "-m", "study.report", "light"]  # another process knows the head from the store
-    subprocess.run(report, cwd=tmp_path, check=True, capture_output=True)
+    report = [
+        sys.executable,
+        "-m",
+        "study.report",
+        "light",
+        "--format",
+        "md",
+    ]
+    again = subprocess.run(report, cwd=tmp_path, check=True, capture_output=True, text=True)
+    assert "rec+light (reconstruction and traffic lights)" in again.stdout
     (manifest,) = (json.loads(path.read_text()) for path in tmp_path.glob("data/frames/*/manifest.json"))
     assert manifest["sets"]["encoder"]["arrays"]["masks"]["shape"] == [40, 3, 512]
     curves = pd.read_parquet(tmp_path / "reports/light/curves.parquet")

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from examples.highway_scenes import SCENES, SHORTEST, record_scene
+from study.birdview.renderer import Renderer, valid_moments
 from study.config.files import load_profile
-from study.data.birdview import Renderer, valid_moments
-from study.episode.adapt import adapt
 from study.episode.checks import check_episode
+from study.intake.adapt import adapt
 
 
 @pytest.fixture(scope="module")

@@ -1,11 +1,12 @@
+import io
 import math
-import xml.etree.ElementTree as ET
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
-from study.analysis import intervals, learning_curves
 from study.analysis.claims import OUTCOMES
 from study.config.grid import Grid
 from study.config.heads import HEAD_SETS
@@ -17,6 +18,8 @@ from study.report.drawings import draw, draw_sweeps
 from study.report.markdown import markdown
 from study.report.summary import summarise
 from study.report.text import document
+from study.report.typesetting import rasterise
+from study.statistics import intervals, learning_curves
 from tests.support.synthetic_records import DATASIZE_GRID, HEADS_GRID, World, simulate
 
 
@@ -110,21 +113,28 @@ def test_labels_that_have_room_stay_at_their_curves(bands):
     assert min(places[name] for name in names) >= 0.02
 
 
-def test_a_figure_is_the_same_bytes_each_time(bands, tmp_path):
-    for folder in ("one", "two"):
-        figure = curves.compare_heads(*bands, steering_floor=0.004, accuracy_floor=0.34)
-        style.save(figure, tmp_path / folder, "f")
-    for kind in ("svg", "png"):
-        one, two = ((tmp_path / folder / f"f.{kind}").read_bytes() for folder in ("one", "two"))
-        assert one == two
-    assert b"<dc:date>" not in one
+def test_a_figure_is_the_same_bytes_each_time(bands):
+    figures = [curves.compare_heads(*bands, steering_floor=0.004, accuracy_floor=0.34) for _ in range(2)]
+    one, two = ({f"f.{kind}": style.paint(figure, kind) for kind in ("svg", "png")} for figure in figures)
+    assert one == two
+    assert b"<dc:date>" not in one["f.svg"]
 
 
-def test_saved_files_are_svg_and_png_and_nothing_is_left_beside_them(heads_figure, tmp_path):
-    vector, raster = style.save(heads_figure, tmp_path, "f")
-    assert ET.parse(vector).getroot().tag.endswith("svg")  # noqa: S314 - our own file
-    assert raster.read_bytes().startswith(b"\x89PNG")
-    assert {path.name for path in tmp_path.iterdir()} == {"f.svg", "f.png"}
+def grey(picture):
+    return np.asarray(Image.open(io.BytesIO(picture)).convert("L"), np.float64)
+
+
+def test_typst_paints_svg_pictures_as_matplotlib_does(heads_figure, bands):
+    other = curves.converge_speed(bands[1], "rec", {}, 0.34)
+    drawn = {"a": heads_figure, "b": other}
+    painted = rasterise({f"{name}.svg": style.paint(figure, "svg") for name, figure in drawn.items()})
+    assert list(painted) == ["a.png", "b.png"]
+    for name, figure in drawn.items():
+        ours, theirs = (grey(content) for content in (painted[f"{name}.png"], style.paint(figure, "png")))
+        assert ours.shape == theirs.shape
+        ours, theirs = (cv2.blur(picture, (9, 9)) for picture in (ours, theirs))  # edges are smoothed differently
+        assert np.abs(ours - theirs).mean() < 0.2 * np.abs(theirs - 255).mean()
+    assert rasterise({}) == {}
 
 
 def test_a_figure_is_written_atomically_in_the_format_of_its_ending(tmp_path):

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from study.birdview.film import HOLD, film, pictures
+from study.birdview.renderer import Renderer
+from study.birdview.scene import SIDE, WORDS, Scene
 from study.config.settings import RecordingSettings, StudySettings, TownSettings
-from study.data.birdview import Renderer
-from study.data.film import HOLD, film, pictures
-from study.data.scene import SIDE, WORDS, Scene
 from study.driving.actors import Expert, FunctionActor
 from study.driving.drives import Drive
 from study.driving.rollout import rollout

@@ -12,18 +12,18 @@ import pandas as pd
 import pytest
 
 from benchmarks.motorway import import_memory, write_motorway
+from study.birdview.renderer import valid_moments
 from study.config.files import load_profile
 from study.config.keys import content_key
 from study.config.settings import FramesSettings
 from study.data.__main__ import main
-from study.data.birdview import valid_moments
 from study.episode.files import read_episode, write_episode
 from study.episode.findings import Findings
-from study.episode.imported import Drive, Imported, open_import
-from study.episode.importing import check_drives, import_drives
-from study.episode.motion import motion_faults
 from study.episode.rows import episode_rows
 from study.errors import BadInputError
+from study.intake.imported import Drive, Imported, open_import
+from study.intake.importing import check_drives, import_drives
+from study.intake.motion import motion_faults
 from study.randomness import rng as rng_of
 from study.sim.record import record_episode
 from tests.support.drives import crossing_drive, write_drives

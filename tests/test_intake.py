@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from study.errors import EXIT_INTERRUPTED, BadInputError
+from study.planning.plan import make_plan
 from study.results.cell_result import load_results
 from study.sweep.__main__ import main
 from study.sweep.offline_results import planned_results, take_in
-from study.sweep.plan import make_plan
 from study.tracking.tracker import Tracker
 from tests.support.processes import ROOT
 from tests.support.run_database import run_database

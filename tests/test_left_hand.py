@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from study.birdview.renderer import Renderer, valid_moments
 from study.config.files import load_profile
 from study.config.keys import recording_key
 from study.config.settings import DynamicsSettings, RecordingSettings, StudySettings, TownSettings
-from study.data.birdview import Renderer, valid_moments
 from study.data.frames import FrameStore, open_frames
 from study.data.prepare import data_flow, frames_folder
 from study.driving.actors import Actor, Expert, FunctionActor

@@ -17,9 +17,10 @@ from benchmarks.power import (
     simulate,
     sized,
 )
-from study.analysis import claims, convergence, learning_curves
-from study.analysis.learning_curves import ACCURACY
+from study.analysis import claims
 from study.config.grid import Rules
+from study.statistics import convergence, learning_curves
+from study.statistics.learning_curves import ACCURACY
 
 
 @pytest.fixture(autouse=True)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from study.birdview.renderer import Renderer
 from study.config.settings import BirdviewSettings
-from study.data.birdview import Renderer
 from study.data.frames import open_frames, unpack_masks
 from study.data.preview import choose_ego, label_text, sample, write_film, write_preview
 from study.errors import BadInputError

@@ -3,17 +3,17 @@
 import numpy as np
 import pytest
 
+from study.birdview.renderer import Renderer, valid_moments
 from study.config.keys import recording_key
 from study.config.settings import DynamicsSettings, RecordingSettings, StudySettings, TownSettings
-from study.data.birdview import Renderer, valid_moments
 from study.driving.drives import Drive
 from study.driving.metrics import score_drive
 from study.driving.ride import Ride
 from study.driving.surface import off_road
-from study.episode.adapt import adapt
 from study.episode.files import read_episode, write_episode
-from study.episode.importing import check_drives
 from study.episode.schema import PEDESTRIAN, RED, Episode
+from study.intake.adapt import adapt
+from study.intake.importing import check_drives
 from study.sim.dynamics import DT
 from study.sim.env import Traffic, make_traffic
 from study.sim.pedestrians import SIZE

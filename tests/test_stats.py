@@ -14,9 +14,10 @@ from statsmodels.stats.weightstats import DescrStatsW
 from benchmarks.power import Truth
 from benchmarks.power import simulate as simulate_study
 from study import randomness
-from study.analysis import comparisons, convergence, intervals, learning_curves, predictions
-from study.analysis.drives import DriveScores
+from study.analysis import predictions
 from study.results.cell_result import TABLE_COLUMNS
+from study.statistics import comparisons, convergence, intervals, learning_curves
+from study.statistics.drives import DriveScores
 from study.tracking.metrics import final_scores
 from tests.support.synthetic_records import DATASIZE_GRID, HEADS_GRID, World, simulate
 

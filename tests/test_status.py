@@ -7,8 +7,8 @@ import shutil
 
 import pytest
 
+from study.planning.plan import make_plan
 from study.sweep.__main__ import main
-from study.sweep.plan import make_plan
 from study.sweep.status import SILENT, cell_statuses, heard_again, seconds_left
 from study.tracking.reader import Attempt
 from study.tracking.tracker import Tracker

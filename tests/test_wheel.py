@@ -6,14 +6,15 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from study.analysis import claims, driving, effects, intervals
+from study.analysis import claims, driving
 from study.analysis.claims import CLAIMS, Evidence
-from study.analysis.drives import DriveScores
-from study.analysis.intervals import Sample
-from study.analysis.learning_curves import ACCURACY, DRIVING
 from study.config.grid import Rules
 from study.config.heads import HEAD_SETS
 from study.results.drives import EXPERT
+from study.statistics import effects, intervals
+from study.statistics.drives import DriveScores
+from study.statistics.intervals import Sample
+from study.statistics.learning_curves import ACCURACY, DRIVING
 from tests.support.synthetic_drives import Wheel, with_drives
 from tests.support.synthetic_records import HEADS_GRID, World, simulate
 

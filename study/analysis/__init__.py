@@ -1,1 +1,1 @@
-"""Statistics, claims and confounds: pure functions of result tables."""
+"""Metrics, claims with their rules, and confounds: pure functions of result tables."""

@@ -15,10 +15,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from study.analysis import driving, effects, learning_curves, predictions
-from study.analysis.effects import label, results_at
+from study.analysis import driving, predictions
 from study.analysis.learned import unlearned
-from study.analysis.learning_curves import ACCURACY, DRIVING, KEYFRAME, STEERING, Point
 from study.analysis.rules import (
     ABOVE,
     DRIVES_BETTER,
@@ -36,6 +34,9 @@ from study.analysis.rules import (
 )
 from study.config.grid import Grid
 from study.results.sweep_record import SweepRecord
+from study.statistics import effects, learning_curves
+from study.statistics.effects import label, results_at
+from study.statistics.learning_curves import ACCURACY, DRIVING, KEYFRAME, STEERING, Point
 
 Outcome = Literal[
     "reproduced",

@@ -10,13 +10,13 @@ import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from study.analysis import comparisons, effects, intervals, learning_curves
-from study.analysis.effects import Interval
-from study.analysis.intervals import Sample
-from study.analysis.learning_curves import ACCURACY, Point
 from study.config.grid import Grid
 from study.config.settings import Number, StudySettings
 from study.results.sweep_record import SweepRecord
+from study.statistics import comparisons, effects, intervals, learning_curves
+from study.statistics.effects import Interval
+from study.statistics.intervals import Sample
+from study.statistics.learning_curves import ACCURACY, Point
 
 
 @dataclass(frozen=True)

@@ -14,14 +14,14 @@ import numpy as np
 import pandas as pd
 from scipy import stats as scipy_stats
 
-from study.analysis import learning_curves
-from study.analysis.drives import DriveScores
-from study.analysis.intervals import Estimate
-from study.analysis.learning_curves import ACCURACY, DRIVING, Panel, Point
 from study.analysis.metrics import Metric
-from study.analysis.proportions import wilson_interval
 from study.results.drives import EXPERT, FACTS
 from study.results.sweep_record import SweepRecord
+from study.statistics import learning_curves
+from study.statistics.drives import DriveScores
+from study.statistics.intervals import Estimate
+from study.statistics.learning_curves import ACCURACY, DRIVING, Panel, Point
+from study.statistics.proportions import wilson_interval
 
 TOWN, UNSEEN = "town", "unseen"
 PLACES = {TOWN: "the study's town", UNSEEN: "towns that nothing was recorded in"}

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 
-from study.analysis.effects import label, results_at
-from study.analysis.learning_curves import Point
 from study.config.grid import Rules
 from study.results.cell_result import CellResult
 from study.results.sweep_record import SweepRecord
+from study.statistics.effects import label, results_at
+from study.statistics.learning_curves import Point
 
 
 def unlearned(record: SweepRecord, points: Iterable[Point]) -> dict[Point, str]:

@@ -13,11 +13,12 @@ import numpy as np
 import pandas as pd
 from pydantic import Field
 
-from study.analysis import learning_curves, predictions
-from study.analysis.learning_curves import ACCURACY, KEYFRAME, LAST, STEERING, Array
+from study.analysis import predictions
 from study.config.paper import ACCELERATIONS
 from study.config.settings import Settings
 from study.results.cell_result import CellResult
+from study.statistics import learning_curves
+from study.statistics.learning_curves import ACCURACY, KEYFRAME, LAST, STEERING, Array
 
 Values = Callable[[CellResult], Array]  # one value for each policy, [S]; empty where the result does not have them
 

@@ -13,9 +13,9 @@ from sklearn.linear_model import Ridge
 from sklearn.model_selection import cross_val_predict
 from sklearn.preprocessing import StandardScaler
 
-from study.analysis.learning_curves import Array
 from study.config.paper import ACCELERATIONS
 from study.randomness import rng
+from study.statistics.learning_curves import Array
 
 CLASSES = range(len(ACCELERATIONS))
 TINY = np.finfo(np.float64).tiny

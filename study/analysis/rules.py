@@ -1,7 +1,7 @@
 """The rules of the paper's claims: from curves and scores by test drive to findings that hold, fail or stay open.
 
 The rules' numbers come from the sweep file (`study.config.grid.Rules`), so they are fixed before the run. Intervals are
-over sampling units and test drives (`study.analysis.intervals.crossed`). A claim is reproduced only when all its
+over sampling units and test drives (`study.statistics.intervals.crossed`). A claim is reproduced only when all its
 findings hold, so each may be read at 1 - alpha: this keeps the claim's error at alpha (intersection-union test, Berger
 1982). It is not reproduced when any fails, so the ends against it are simultaneous, at 1 - alpha over the number of
 findings. Where a cell has one encoder only (design A), an allowance for other encoders is added to the ends.
@@ -16,12 +16,12 @@ from typing import Literal
 
 from scipy import special
 
-from study.analysis import comparisons, convergence, effects, intervals, learning_curves
-from study.analysis.effects import Drives, Interval, Unit, difference_label, label
-from study.analysis.intervals import Crossed, Estimate, Sample
-from study.analysis.learning_curves import ACCURACY, DRIVING, KEYFRAME, STEERING, Panel, Point
 from study.config.grid import Grid, Rules
 from study.config.settings import Number
+from study.statistics import comparisons, convergence, effects, intervals, learning_curves
+from study.statistics.effects import Drives, Interval, Unit, difference_label, label
+from study.statistics.intervals import Crossed, Estimate, Sample
+from study.statistics.learning_curves import ACCURACY, DRIVING, KEYFRAME, STEERING, Panel, Point
 
 State = Literal["holds", "fails", "open"]
 Pair = tuple[Point, Point]

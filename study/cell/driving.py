@@ -9,10 +9,10 @@ from typing import Any
 import pandas as pd
 import torch
 
+from study.birdview.film import film
 from study.cell.job import CellJob
 from study.cell.stages import Reporter, begin
 from study.config.settings import StudySettings
-from study.data.film import film
 from study.driving.actors import Actor, Expert, PolicyActor
 from study.driving.cell_actor import cell_actor
 from study.driving.drives import Drive

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from study.config.grid import Cell
 from study.config.settings import StudySettings
-from study.episode.imported import Imported
+from study.intake.imported import Imported
 from study.stages import Work
 
 

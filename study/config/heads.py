@@ -15,7 +15,7 @@ class Head:
     """A decoder head.
 
     `word` names it in reports. `channels` of the output: 3 for the image, 1 for a mask. `target` is what the head
-    learns: "image" is the input itself; else the mask that a function of `study.data.targets` paints, or, as
+    learns: "image" is the input itself; else the mask that a function of `study.birdview.targets` paints, or, as
     "module:function", one of another module. `loss` is a key of `study.encoder.autoencoder.LOSSES`.
     """
 

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from study.atomic import atomic_folder
 from study.console.terminal import follow
-from study.episode.adapt import resample
 from study.episode.chart import REACH
 from study.episode.files import write_episode
 from study.episode.recording import Recording
 from study.episode.rows import Rows
 from study.episode.schema import OPTIONAL_FLOATS, Agent, Lane, Light
 from study.errors import BadInputError
+from study.intake.adapt import resample
 
 SHORTEST = 3.0  # a recording below it has no moment with a second of history and one of future [s]
 

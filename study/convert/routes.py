@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from study.episode.adapt import progress_along
 from study.episode.rows import Rows
 from study.episode.schema import PEDESTRIAN, Agent
+from study.intake.adapt import progress_along
 
 CHANGE = 20.0  # a change of lane on a route is a straight line of about this length [m]
 JOINED = 0.5  # ends of lines nearer than this are one point [m]

@@ -1,1 +1,1 @@
-"""From Episodes to frames: bird views, head targets, selection, store and data card."""
+"""From Episodes to frames: selection, store, data card and preview (Sec. IV-A, V)."""

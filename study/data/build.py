@@ -19,10 +19,10 @@ from filelock import FileLock
 from numpy.typing import NDArray
 
 from study.atomic import write_atomic
+from study.birdview.renderer import Renderer
 from study.config.heads import further_masks, mask_heads
 from study.config.keys import FORMAT_VERSIONS, content_key
 from study.config.settings import BirdviewSettings, FramesSettings
-from study.data.birdview import Renderer
 from study.data.frames import PARTS, SCHEMA_VERSION, DamagedFramesError, open_frames, shapes
 from study.data.selection import LABELS, SETS, Columns, candidates, choose, histograms
 from study.episode.files import read_episode

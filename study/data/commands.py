@@ -19,9 +19,9 @@ from study.data.prepare import data_flow, drives_flow, drives_folder
 from study.data.preview import write_preview
 from study.engine.flows import run_flow
 from study.engine.local import local_engine
-from study.episode.imported import open_import
-from study.episode.importing import check_drives, describe, import_drives
 from study.errors import EXIT_BAD_INPUT, BadInputError
+from study.intake.imported import open_import
+from study.intake.importing import check_drives, describe, import_drives
 from study.stages import Flow, data_cost, recording_cost
 
 

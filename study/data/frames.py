@@ -23,8 +23,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from study.birdview.renderer import MASK_BYTES
 from study.config.paper import IMAGE
-from study.data.birdview import MASK_BYTES
 from study.data.selection import LABELS, SETS, Indices
 from study.episode.head import file_digest
 from study.errors import BadInputError

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from study.data.birdview import Moments
+from study.birdview.renderer import Moments
 from study.episode.files import read_episode
 from study.episode.head import episode_digest
 from study.episode.schema import Episode

@@ -13,8 +13,8 @@ from study.config.modules import load_modules
 from study.config.settings import StudySettings
 from study.config.workspace import HERE
 from study.engine.flows import run_flow
-from study.episode.imported import Imported
 from study.errors import BadInputError
+from study.intake.imported import Imported
 from study.stages import Flow, data_cost, recording_cost, size_text
 
 POLICY_SEED = 1_000_000  # the policy set's drives are numbered from here: never those of the encoder set (Sec. V-A)

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from study.atomic import atomic_folder
+from study.birdview.renderer import Renderer
 from study.config.paper import ACCELERATIONS, IMAGE
 from study.config.settings import BirdviewSettings
-from study.data.birdview import Renderer
 from study.data.frames import Frames, FrameStore, unpack_masks
 from study.data.selection import SETS
 from study.episode.files import read_episode

@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from study.birdview.limits import Limits
+from study.birdview.renderer import Moments, valid_moments
 from study.config.paper import ACCELERATIONS, STEERING_CROP
 from study.config.settings import BirdviewSettings, FramesSettings
-from study.data.birdview import Moments, valid_moments
-from study.data.limits import Limits
 from study.data.true_state import state_of
 from study.episode.files import read_episode
-from study.episode.imported import take_groups
 from study.episode.schema import RATE_HZ, Episode
 from study.errors import BadInputError
+from study.intake.imported import take_groups
 from study.randomness import rng
 
 SETS = ("encoder", "policy")

@@ -15,10 +15,10 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from study.birdview.limits import Limits
+from study.birdview.renderer import Moments, governing_light
 from study.config.paper import LATENT
 from study.config.settings import BirdviewSettings
-from study.data.birdview import Moments, governing_light
-from study.data.limits import Limits
 from study.data.past_speeds import past_speeds, speeds_before
 from study.episode.schema import Episode
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from study.data.targets import corners
+from study.birdview.targets import corners
 from study.driving.surface import beyond_lanes
 from study.episode.schema import Lane
 from study.sim.dynamics import DT

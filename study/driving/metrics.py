@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from study.analysis.comfort import comfortable
-from study.data.targets import corners
+from study.birdview.targets import corners
 from study.driving.faults import at_fault
 from study.driving.surface import off_road
 from study.episode.schema import PEDESTRIAN, RED, Agent, Episode

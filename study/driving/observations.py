@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from study.data.birdview import Image
+from study.birdview.renderer import Image
 from study.data.true_state import Columns
 
 

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from study.birdview.limits import Limits
+from study.birdview.renderer import Image, Renderer
 from study.config.keys import drive_name
 from study.config.paper import ACCELERATIONS
 from study.config.settings import SPEEDS, StudySettings
-from study.data.birdview import Image, Renderer
-from study.data.limits import Limits
 from study.data.true_state import Columns, live_state
 from study.driving.drives import Drive
 from study.episode.schema import Episode

@@ -7,9 +7,9 @@ from functools import cache
 
 import numpy as np
 
+from study.birdview.limits import Limits
 from study.config.paper import IMAGE
 from study.config.settings import SPEEDS, StudySettings
-from study.data.limits import Limits
 from study.data.true_state import Columns
 from study.driving.actors import Actor, Expert
 from study.driving.drives import Drive

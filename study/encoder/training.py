@@ -130,38 +130,51 @@ def train_encoder(
     }
     monitor = _Monitor(module, plan, training, checkpoint, log, progress)
     monitor.resume()
-    state = monitor.state
-    epochs = plan.epochs - state.epoch
-    if epochs:
-        if target.type == "cpu":
-            keep_memory()
-        elif target.type == "cuda":
-            module.to(memory_format=torch.channels_last)
-            if epochs * plan.frames_an_epoch >= FUSED_IMAGES:
-                module.fuse()
-        data = TrainingData(resident(frames, target, room), plan, state, target)
-        with trainer(
-            target,
-            epochs,
-            f"batch {plan.batch}",
-            "lower --encoder.batch",
-            precision="bf16-mixed" if precision == "bf16" else "32-true",
-            callbacks=[monitor],
-            num_sanity_val_steps=0,
-            benchmark=target.type == "cuda",  # sizes of batches hardly change: let cuDNN try which kernel is fastest
-            reload_dataloaders_every_n_epochs=1,
-        ) as lightning_trainer:
-            lightning_trainer.fit(module, datamodule=data)
-        monitor.save()
+    if monitor.state.epoch < plan.epochs:
+        _fit(module, monitor, frames, plan, target, precision, room)
     encoder = {name: value.numpy(force=True).copy() for name, value in module.encoder.state_dict().items()}
     return TrainedEncoder(
         weights=encoder,
-        curves=pd.DataFrame(state.rows, columns=["split", "epoch", "metric", "value"]),
+        curves=pd.DataFrame(monitor.state.rows, columns=["split", "epoch", "metric", "value"]),
         samples=paint_samples(module, frames, choose_samples(frames)),
         frames=len(plan.subset),
-        seconds=state.seconds,
+        seconds=monitor.state.seconds,
         precision=precision,
     )
+
+
+def _fit(
+    module: MultiHeadAutoencoder,
+    monitor: _Monitor,
+    frames: Frames,
+    plan: TrainingPlan,
+    target: torch.device,
+    precision: str,
+    room: int,
+) -> None:
+    """Train for the epochs that are left; `room` is a GPU's memory that the training itself takes [bytes]."""
+    epochs = plan.epochs - monitor.state.epoch
+    if target.type == "cpu":
+        keep_memory()
+    elif target.type == "cuda":
+        module.to(memory_format=torch.channels_last)
+        if epochs * plan.frames_an_epoch >= FUSED_IMAGES:
+            module.fuse()
+    with trainer(
+        target,
+        epochs,
+        f"batch {plan.batch}",
+        "lower --encoder.batch",
+        precision="bf16-mixed" if precision == "bf16" else "32-true",
+        callbacks=[monitor],
+        num_sanity_val_steps=0,
+        benchmark=target.type == "cuda",  # sizes of batches hardly change: let cuDNN try which kernel is fastest
+        reload_dataloaders_every_n_epochs=1,
+    ) as lightning_trainer:
+        lightning_trainer.fit(
+            module, datamodule=TrainingData(resident(frames, target, room), plan, monitor.state, target)
+        )
+    monitor.save()
 
 
 class _Monitor(lightning.Callback):

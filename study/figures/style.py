@@ -24,6 +24,7 @@ SIDES = (("o", None), ("D", "white"))  # marker and fill of the first of two swe
 GREY = "#666666"
 Drawing = Figure  # the type, for packages that do not speak to matplotlib
 WIDTH = 6.4  # [in], the report's text width
+DOTS = 200  # per inch
 FONT = "DejaVu Sans"  # comes with matplotlib, so every machine draws the same
 STYLE: dict[Any, Any] = {
     "font.size": 7.5,
@@ -61,20 +62,17 @@ def look(name: str) -> HeadSet:
     return HEAD_SETS.get(name) or HeadSet(name, (), name, colour, ":", "v")
 
 
-def save(figure: Figure, folder: Path, name: str) -> tuple[Path, Path]:
-    """Write a figure as `name.svg` and `name.png`."""
-    paths = folder / f"{name}.svg", folder / f"{name}.png"
-    for path in paths:
-        write(figure, path)
-    return paths
+def paint(figure: Figure, kind: str) -> bytes:
+    """Return a figure as a file of a format of METADATA (200 dots per inch), the same bytes each time."""
+    stream = io.BytesIO()
+    with mpl.rc_context(STYLE):
+        figure.savefig(stream, format=kind, dpi=DOTS, metadata=METADATA[kind])
+    return stream.getvalue()
 
 
 def write(figure: Figure, path: Path) -> None:
-    """Write a figure whole, in the format of its ending (METADATA; 200 dots per inch), the same bytes each time."""
-    kind, stream = path.suffix[1:].lower(), io.BytesIO()
-    with mpl.rc_context(STYLE):
-        figure.savefig(stream, format=kind, dpi=200, metadata=METADATA[kind])
-    write_atomic(path, stream.getvalue())
+    """Write a figure whole, in the format of its ending."""
+    write_atomic(path, paint(figure, path.suffix[1:].lower()))
 
 
 def new_figure(height: float, columns: int = 1, rows: int = 1) -> tuple[Figure, list[Axes]]:

@@ -70,35 +70,13 @@ def train_policies(
     _check(z_train, z_test, labels_train, labels_test, seeds, settings)
     scaling = normalisation(z_train, settings.normalise)
     data = _policy_data(scaling, (z_train, labels_train), (z_test, labels_test), torch.device(device))
-    points: list[pd.DataFrame] = []
-
-    def after_epoch(epoch: int, values: Arrays) -> None:
-        broken = ~np.isfinite(np.stack(list(values.values()))).all(axis=(0, 1))
-        if broken.any():
-            raise TrainingDivergedError(
-                f"policies: the loss of seed {seeds[int(broken.argmax())]} is not finite after epoch {epoch}; "
-                f"try a lower policy.lr than {settings.lr:g}"
-            )
-        points.append(_points(seeds, epoch, values))
-        if log:
-            means = {split: metrics.mean(axis=1).tolist() for split, metrics in values.items()}
-            log(
-                epoch,
-                {
-                    f"{split}/{metric}": mean
-                    for split in means
-                    for metric, mean in zip(METRICS, means[split], strict=True)
-                },
-            )
-        if progress:
-            progress(epoch, settings.epochs)
-
+    points = _Points(seeds, settings, log, progress)
     if device == "cpu":
         keep_memory()
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        ensemble = PolicyEnsemble(seeds, settings, data, after_epoch)
+        ensemble = PolicyEnsemble(seeds, settings, data, points.add)
         with trainer(
             torch.device(device),
             settings.epochs,
@@ -111,7 +89,7 @@ def train_policies(
         torch.set_num_threads(threads)
     return TrainedPolicies(
         weights=ensemble.weights() | scaling,
-        curves=pd.concat(points, ignore_index=True)[list(CURVE_COLUMNS)],
+        curves=pd.concat(points.epochs, ignore_index=True)[list(CURVE_COLUMNS)],
         acceleration=logits.argmax(2).to(torch.uint8).cpu().numpy(),
         steering=steering.cpu().numpy(),
         seconds=time.perf_counter() - started,
@@ -185,12 +163,33 @@ def _policy_data(scaling: Arrays, train: Labelled, test: Labelled, device: torch
     )
 
 
-def _points(seeds: Sequence[int], epoch: int, values: dict[str, NDArray[Any]]) -> pd.DataFrame:
-    """Return the rows of the tidy table for one epoch."""
-    index = pd.MultiIndex.from_product([values, METRICS, seeds], names=["split", "metric", "policy_seed"])
-    numbers = np.concatenate([metrics.reshape(-1) for metrics in values.values()])
-    return (
-        pd.DataFrame({"value": numbers.astype(np.float64)}, index=index)
-        .reset_index()
-        .assign(stage="policy", epoch=epoch)
-    )
+class _Points:
+    """The points of the tidy table, epoch by epoch; whoever listens is told of each."""
+
+    def __init__(
+        self, seeds: Sequence[int], settings: PolicySettings, log: Log | None, progress: Progress | None
+    ) -> None:
+        self.seeds, self.settings, self.log, self.progress = seeds, settings, log, progress
+        self.epochs: list[pd.DataFrame] = []
+
+    def add(self, epoch: int, values: Arrays) -> None:
+        """Add an epoch: metrics [METRICS, seeds] by split. Raises TrainingDivergedError where one is not finite."""
+        broken = ~np.isfinite(np.stack(list(values.values()))).all(axis=(0, 1))
+        if broken.any():
+            raise TrainingDivergedError(
+                f"policies: the loss of seed {self.seeds[int(broken.argmax())]} is not finite after epoch {epoch}; "
+                f"try a lower policy.lr than {self.settings.lr:g}"
+            )
+        index = pd.MultiIndex.from_product([values, METRICS, self.seeds], names=["split", "metric", "policy_seed"])
+        numbers = np.concatenate([metrics.reshape(-1) for metrics in values.values()])
+        rows = pd.DataFrame({"value": numbers.astype(np.float64)}, index=index).reset_index()
+        self.epochs.append(rows.assign(stage="policy", epoch=epoch))
+        if self.log:
+            means = {
+                f"{split}/{metric}": mean
+                for split, metrics in values.items()
+                for metric, mean in zip(METRICS, metrics.mean(axis=1).tolist(), strict=True)
+            }
+            self.log(epoch, means)
+        if self.progress:
+            self.progress(epoch, self.settings.epochs)

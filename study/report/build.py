@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
-
-import typst
 
 from study.atomic import write_atomic
 from study.config.workspace import HERE
 from study.errors import EXIT_FAILED, BadInputError, masked
 from study.figures.fonts import fonts_for, lettering
-from study.figures.style import METADATA, save, write
+from study.figures.style import METADATA, paint, write
 from study.report.comparison import compare
 from study.report.document import Block
 from study.report.drawings import draw, draw_sweeps
@@ -24,12 +20,12 @@ from study.report.markdown import markdown
 from study.report.model import Report, read_report
 from study.report.summary import summarise
 from study.report.text import document
+from study.report.typesetting import rasterise, typeset
 from study.results.sweep_record import SweepRecord
 from study.tracking.reader import Reader
 from study.tracking.tracker import Tracker
 from study.tracking.variants import with_variants
 
-TEMPLATE = Path(__file__).with_name("report.typ")
 DRIVES = "drives.parquet"
 
 
@@ -45,10 +41,13 @@ def build_report(record: SweepRecord, folder: Path = HERE.reports) -> Path:
         print(f"warning: {fonts.warning}", file=sys.stderr)
     with lettering(fonts):
         figures = draw(record, report)
-        written = [file for name, figure in figures.items() for file in save(figure, files / "figures", name)]
+        pictures = {f"figures/{name}.svg": paint(figure, "svg") for name, figure in figures.items()}
     report = report.model_copy(update={"figures": tuple(figures), "characters": fonts.warning})
+    written = pictures | rasterise(pictures)
+    for name, content in written.items():
+        write_atomic(files / name, content)
     for file in (files / "figures").glob("*"):
-        if file not in written:  # of an earlier report with other cells
+        if f"figures/{file.name}" not in written:  # of an earlier report with other cells
             file.unlink()
     write_atomic(files / "report.json", report.json())
     write_atomic(files / "curves.parquet", record.table(baselines=True).to_parquet(index=False))
@@ -56,23 +55,10 @@ def build_report(record: SweepRecord, folder: Path = HERE.reports) -> Path:
         (files / DRIVES).unlink(missing_ok=True)  # of an earlier report
     else:
         write_atomic(files / DRIVES, record.drive_table.to_parquet(index=False))
-    pictures = {f"figures/{file.name}": file.read_bytes() for file in written if file.suffix == ".svg"}
     pdf = folder / f"{record.grid.name}.pdf"
     sweep = report.sweep
     title, footer = f"{sweep.title} ({sweep.name}, {sweep.profile})", f"{sweep.name} ({sweep.profile})"
     write_atomic(pdf, typeset(title, footer, document(report), pictures, fonts.files))
-    return pdf
-
-
-def typeset(
-    title: str, footer: str, blocks: Sequence[Block], pictures: dict[str, bytes], fonts: Sequence[Path] = ()
-) -> bytes:
-    """Return the PDF of a document and its pictures, with the fonts that Typst brings along, and some others."""
-    listed = [{"kind": type(block).__name__, **asdict(block)} for block in blocks]
-    content = json.dumps({"title": title, "footer": footer, "blocks": listed}).encode()
-    files = {"main.typ": TEMPLATE.read_bytes(), "document.json": content, **pictures}
-    # Its type stub does not know of files by name, which its documentation has.
-    pdf: bytes = typst.compile(files, format="pdf", ignore_system_fonts=True, font_paths=fonts)  # type: ignore[call-overload]
     return pdf
 
 

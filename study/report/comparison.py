@@ -12,11 +12,7 @@ from functools import partial
 
 import numpy as np
 
-from study.analysis import comparisons
 from study.analysis.claims import Verdict
-from study.analysis.effects import MINUS, ordered
-from study.analysis.intervals import Estimate
-from study.analysis.learning_curves import ACCURACY, DRIVING, Point
 from study.analysis.metrics import Metric
 from study.config.baselines import BASELINES
 from study.config.grid import Cell
@@ -25,6 +21,10 @@ from study.report.driving import EXPERT
 from study.report.model import Report, Score, Spread
 from study.report.rounding import NOTHING, UNITS, between, epochs, fixed, interval, percent, show
 from study.report.text import counts, render, title
+from study.statistics import comparisons
+from study.statistics.effects import MINUS, ordered
+from study.statistics.intervals import Estimate
+from study.statistics.learning_curves import ACCURACY, DRIVING, Point
 
 CHANGES = {True: " with uncommitted changes", False: "", None: ", whether changed is unknown"}
 Rows = list[list[object]]

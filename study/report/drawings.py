@@ -10,9 +10,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from study.analysis import effects, intervals, learning_curves, predictions
-from study.analysis.intervals import Estimate
-from study.analysis.learning_curves import ACCURACY, STEERING
+from study.analysis import predictions
 from study.config.baselines import BASELINES
 from study.config.heads import HEADS
 from study.errors import BadInputError
@@ -24,6 +22,9 @@ from study.report.driving import draw_driving
 from study.report.model import Report, Score, VariedSetting
 from study.results.cell_result import CellResult
 from study.results.sweep_record import SweepRecord
+from study.statistics import effects, intervals, learning_curves
+from study.statistics.intervals import Estimate
+from study.statistics.learning_curves import ACCURACY, STEERING
 
 
 def draw(record: SweepRecord, report: Report) -> dict[str, Drawing]:

@@ -8,11 +8,8 @@ from functools import partial
 
 import pandas as pd
 
-from study.analysis import driving, effects, intervals
-from study.analysis.drives import DriveScores
+from study.analysis import driving
 from study.analysis.driving import ENDS, PER_KM, RATES, SCORES
-from study.analysis.intervals import Sample
-from study.analysis.learning_curves import DRIVING, Point
 from study.analysis.metrics import Metric
 from study.config.baselines import BASELINES
 from study.figures import driving as figures
@@ -22,6 +19,10 @@ from study.report.model import Driving, DrivingPlace, DrivingScore, Spread
 from study.report.rounding import fixed, interval, show
 from study.report.spread import spread, spread_of
 from study.results.sweep_record import SweepRecord
+from study.statistics import effects, intervals
+from study.statistics.drives import DriveScores
+from study.statistics.intervals import Sample
+from study.statistics.learning_curves import DRIVING, Point
 
 EXPERT = "expert"
 

@@ -12,16 +12,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-from study.analysis import confounds, learning_curves
+from study.analysis import confounds
 from study.analysis.claims import OUTCOMES, Verdict
-from study.analysis.effects import Contrast, Interval
-from study.analysis.intervals import Estimate
-from study.analysis.learning_curves import Point
 from study.analysis.metrics import Metric
 from study.config.baselines import BASELINES, CEILING
 from study.config.files import validated
 from study.config.settings import Number, Settings
 from study.errors import BadInputError
+from study.statistics import learning_curves
+from study.statistics.effects import Contrast, Interval
+from study.statistics.intervals import Estimate
+from study.statistics.learning_curves import Point
 
 FORMAT_VERSION = 3  # 3: baselines beside the head sets
 

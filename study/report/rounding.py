@@ -7,11 +7,11 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 
-from study.analysis.effects import MINUS
-from study.analysis.intervals import Estimate
-from study.analysis.learning_curves import STEERING
 from study.analysis.metrics import METRICS, Metric
 from study.report.model import Spread
+from study.statistics.effects import MINUS
+from study.statistics.intervals import Estimate
+from study.statistics.learning_curves import STEERING
 
 NOTHING = "\N{EM DASH}"
 LOSS = METRICS[STEERING].unit

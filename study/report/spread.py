@@ -6,9 +6,9 @@ import math
 
 import pandas as pd
 
-from study.analysis import intervals, learning_curves
-from study.analysis.intervals import Estimate, Sample
 from study.report.model import Spread
+from study.statistics import intervals, learning_curves
+from study.statistics.intervals import Estimate, Sample
 
 
 def spread(sample: Sample) -> Spread:

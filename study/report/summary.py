@@ -11,20 +11,7 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
-from study.analysis import (
-    claims,
-    comparisons,
-    confounds,
-    convergence,
-    effects,
-    intervals,
-    learning_curves,
-    metrics,
-    predictions,
-)
-from study.analysis.drives import by_drive
-from study.analysis.intervals import Crossed, Sample
-from study.analysis.learning_curves import ACCURACY, STEERING, Point
+from study.analysis import claims, confounds, metrics, predictions
 from study.analysis.metrics import METRICS, Metric
 from study.config.baselines import BASELINES, CEILING
 from study.config.heads import HEADS, heads_of
@@ -50,6 +37,10 @@ from study.report.spread import spread
 from study.results.cell_result import CellResult
 from study.results.sweep_record import SweepRecord
 from study.stages import RESULT_BYTES, data_cost
+from study.statistics import comparisons, convergence, effects, intervals, learning_curves
+from study.statistics.drives import by_drive
+from study.statistics.intervals import Crossed, Sample
+from study.statistics.learning_curves import ACCURACY, STEERING, Point
 
 SHOWN_PACKAGES = ("torch", "lightning", "highway-env", "gymnasium", "numpy", "scipy", "mlflow", "optuna", "typst")
 SIMULATOR = "a town of our own on highway-env, in the place of CARLA's Town03"

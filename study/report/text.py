@@ -10,7 +10,6 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from study.analysis.claims import Verdict
-from study.analysis.learning_curves import KEYFRAME
 from study.analysis.metrics import Metric
 from study.config.baselines import BASELINES
 from study.config.heads import HEAD_SETS
@@ -18,6 +17,7 @@ from study.report import driving, rounding
 from study.report.document import Block, Inline, bold, code, italic, parse, plain, table
 from study.report.model import Report, Score, Spread
 from study.report.rounding import LOSS, NOTHING, UNITS, interval, percent, show, thousands
+from study.statistics.learning_curves import KEYFRAME
 
 FURTHER_COLUMNS = 5  # metrics that a page has room for, each with its standard deviation
 ROUNDINGS = (

@@ -19,9 +19,9 @@ import click
 from study.console.interrupts import stoppable
 from study.console.options import invoke, run, tracking_option
 from study.errors import BadInputError
-from study.sweep import options
-from study.sweep.dry_run import dry_run
-from study.sweep.plan import Plan
+from study.planning import options
+from study.planning.dry_run import dry_run
+from study.planning.plan import Plan
 
 no_report = click.option("--no-report", is_flag=True, help="stop when the cells are finished")
 

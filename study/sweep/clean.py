@@ -21,10 +21,10 @@ from study.console.display import show_table
 from study.data.in_use import sole_use
 from study.engine.trials import forget
 from study.errors import BadInputError, masked
+from study.planning.plan import look_up, study_name
 from study.stages import duration_text, size_text
 from study.sweep.cached_data import Cached, cached_data, remove, used_keys
 from study.sweep.locks import hold_store, store_folder
-from study.sweep.plan import look_up, study_name
 from study.tracking.cleaning import Deletion, StoredSweep, plan_deletion, shrink, stored_sweeps
 from study.tracking.experiment import TrackerLostError
 from study.tracking.reader import Reader, is_named

@@ -19,11 +19,11 @@ from study.engine.room import with_room
 from study.engine.tasks import Failure
 from study.engine.trials import Trials
 from study.errors import BadInputError, masked
+from study.planning.options import RunOptions
+from study.planning.plan import Plan, cell_jobs
 from study.results.cell_result import CellResult
 from study.stages import Flow
 from study.sweep.locks import store_folder
-from study.sweep.options import RunOptions
-from study.sweep.plan import Plan, cell_jobs
 from study.tracking.cell_run import CellRun
 from study.tracking.experiment import DeletedError, TrackerLostError
 from study.tracking.tracker import Tracker

@@ -14,10 +14,10 @@ from typing import Any
 import click
 
 from study.atomic import write_atomic
+from study.birdview.film import check_suffix, film
+from study.birdview.scene import ENDINGS
 from study.console.interrupts import check_stopped
 from study.console.terminal import print_table
-from study.data.film import check_suffix, film
-from study.data.scene import ENDINGS
 from study.driving.actors import Actor, Commands, Expert
 from study.driving.cell_actor import cell_actor
 from study.driving.drives import Drive, held_out_drives
@@ -27,8 +27,8 @@ from study.driving.rollout import ActorError, rollout
 from study.driving.user_function import function_actor, place
 from study.episode.schema import Episode
 from study.errors import BadInputError, one_of
+from study.planning.plan import Plan, cell_jobs, look_up
 from study.sim.dynamics import DT
-from study.sweep.plan import Plan, cell_jobs, look_up
 from study.sweep.verify import choose
 
 COUNTED = ("count", "0 or 1")  # units of scores without decimals

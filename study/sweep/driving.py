@@ -14,9 +14,9 @@ from study.driving.drives import planned_drives
 from study.engine.flows import Listener, run_flow, run_flows
 from study.engine.tasks import Engine, Failure
 from study.errors import BadInputError, masked
+from study.planning.options import RunOptions
+from study.planning.plan import Plan, cell_jobs
 from study.stages import DRIVE, Flow
-from study.sweep.options import RunOptions
-from study.sweep.plan import Plan, cell_jobs
 from study.tracking.driven import commit_drives
 from study.tracking.reader import Reader
 from study.tracking.tracker import Tracker

@@ -11,9 +11,9 @@ from typing import Any
 from study.compute.provenance import provenance
 from study.driving.driver import export_driver
 from study.errors import BadInputError
+from study.planning.plan import Plan
 from study.results.cell_result import CellResult, load_results
 from study.sweep.locks import hold_store
-from study.sweep.plan import Plan
 from study.sweep.run import open_sweep, write_report
 from study.tracking.tracker import Tracker
 

@@ -21,13 +21,13 @@ from study.engine.inline import InlineEngine
 from study.engine.local import local_engine
 from study.engine.tasks import Engine
 from study.errors import EXIT_FAILED
+from study.planning.options import RunOptions
+from study.planning.plan import Plan, plan_display
 from study.report.build import publish
 from study.stages import DESCRIBE, Batch, Flow, Task
 from study.sweep.committing import Committing
 from study.sweep.driving import drive_cells, undriven
 from study.sweep.locks import hold_store, temporary_folder
-from study.sweep.options import RunOptions
-from study.sweep.plan import Plan, plan_display
 from study.tracking.tracker import Tracker
 
 

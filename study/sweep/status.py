@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Literal
 
 from study.console.display import show_table
 from study.errors import masked
+from study.planning.plan import Plan, look_up
 from study.stages import CELL_STAGES, RESULT_S, STAGES, duration_text, share_done
-from study.sweep.plan import Plan, look_up
 
 if TYPE_CHECKING:
     from study.tracking.reader import Attempt

@@ -30,9 +30,9 @@ from study.engine.flows import Listener, run_flow, run_flows
 from study.engine.inline import InlineEngine
 from study.engine.tasks import Failure
 from study.errors import EXIT_AGAIN, EXIT_FAILED, BadInputError
+from study.planning.plan import Plan, cell_jobs, plan_display
 from study.results.cell_result import CellResult
 from study.stages import Flow
-from study.sweep.plan import Plan, cell_jobs, plan_display
 
 if TYPE_CHECKING:  # Dask, which may be missing
     from study.engine.dask_engine import DaskEngine

@@ -35,8 +35,8 @@ from study.data.prepare import data_flow
 from study.engine.flows import run_flow
 from study.engine.local import local_engine
 from study.errors import BadInputError, one_of
+from study.planning.plan import Plan, look_up, plan_display
 from study.results.cell_result import ARRAYS, CURVE_COLUMNS, CellResult
-from study.sweep.plan import Plan, look_up, plan_display
 from study.tracking.metrics import final_scores
 
 EXIT_DIFFERS = 1

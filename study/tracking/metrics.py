@@ -14,9 +14,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from study.analysis.intervals import t_limits
-from study.analysis.learning_curves import final
 from study.results.cell_result import NO_SEED, CellResult
+from study.statistics.intervals import t_limits
+from study.statistics.learning_curves import final
 
 CurvePoint = tuple[str, int, float]  # metric, epoch, value
 

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from study.birdview.renderer import Renderer
 from study.config.settings import BirdviewSettings
-from study.data.birdview import Renderer
 from study.data.frames import unpack_masks
 from study.episode.files import write_episode
 from study.episode.schema import GREEN, RED, YELLOW, Agent, Episode, Lane, Light, empty_states

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import click
 
-from study.sweep.options import plan_options
-from study.sweep.plan import Plan
+from study.planning.options import plan_options
+from study.planning.plan import Plan
 
 
 def plan_of(words: Sequence[str]) -> Plan:

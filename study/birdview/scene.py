@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from PIL import Image as Pillow
 from PIL import ImageDraw, ImageFont
 
+from study.birdview.targets import FRACTION_BITS, Floats, corners, fixed_point, painted_sizes
 from study.config.paper import ACCELERATIONS, IMAGE
-from study.data.targets import FRACTION_BITS, Floats, corners, fixed_point, painted_sizes
 from study.episode.schema import VEHICLE, Episode
 from study.figures.style import BLUE, FRACTION_COLOUR, GREY, VERMILION
 

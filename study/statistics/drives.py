@@ -14,9 +14,9 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy import special
 
-from study.analysis.learning_curves import ACCURACY, KEYFRAME, STEERING, Array
 from study.products import Arrays
 from study.results.cell_result import CellResult
+from study.statistics.learning_curves import ACCURACY, KEYFRAME, STEERING, Array
 
 
 @dataclass(frozen=True)

@@ -263,7 +263,7 @@ class _Tracks:
         speed = rows["speed"][middle].astype(np.float64)
         value = rows["steering"][middle].astype(np.float64)
         slip = np.arcsin(np.clip(turned * length[middle] / (2 * np.maximum(speed, 1)), -0.9, 0.9))
-        needs = np.arctan(2 * np.tan(slip))  # as in `study.episode.adapt`
+        needs = np.arctan(2 * np.tan(slip))  # as in `study.intake.adapt`
         shows = (speed > 2) & (np.abs(turned) > BEND) & np.isfinite(value) & ~self.contrary[middle]
         middle, value, needs = middle[shows], value[shows] * DynamicsSettings().steering_unit, needs[shows]
         ratio, agent = value / needs, rows["agent"][middle]

@@ -6,8 +6,8 @@ import json
 
 from study.config.heads import heads_of
 from study.config.paper import parameter_counts
+from study.planning.plan import Plan, look_up
 from study.stages import DRIVE, Cost, duration_text, size_text, total
-from study.sweep.plan import Plan, look_up
 
 
 def dry_run(plan: Plan, tracking: str, *, as_json: bool) -> int:

@@ -25,9 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from study.config.settings import DynamicsSettings
-from study.episode.motion import wrap
 from study.episode.schema import RATE_HZ, Episode
 from study.errors import BadInputError
+from study.intake.motion import wrap
 
 SLOWEST_RATE = 2.0  # below it, straight lines between positions are too far from a drive [Hz]
 STEERING_UNIT = DynamicsSettings().steering_unit  # wheel angle [rad] of a steering label of one, as in our town

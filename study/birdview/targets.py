@@ -68,7 +68,7 @@ def find_target(name: str) -> Target:
         target: Target = getattr(importlib.import_module(module or __name__), function)
     except (ImportError, AttributeError) as error:
         raise BadInputError(
-            f"target '{name}' cannot be used: {error}; name a function of study.data.targets, or 'module:function'"
+            f"target '{name}' cannot be used: {error}; name a function of study.birdview.targets, or 'module:function'"
         ) from error
     return target
 

@@ -9,9 +9,9 @@ import numpy as np
 import pandas as pd
 from scipy import stats as scipy_stats
 
-from study.analysis.intervals import LEVEL, Crossed, Estimate, t_limits
-from study.analysis.learning_curves import LAST, Array, by_seed, encoders, final
 from study.randomness import rng
+from study.statistics.intervals import LEVEL, Crossed, Estimate, t_limits
+from study.statistics.learning_curves import LAST, Array, by_seed, encoders, final
 
 DRAWS = 10_000  # bootstrap resamples; a fifth of them of a whole curve
 

@@ -15,7 +15,7 @@ from study.config.settings import StudySettings
 from study.console.options import Decorator, bundled, nested, profile_option, settings_options, tracking_option
 from study.engine.cluster_options import check_cluster
 from study.errors import BadInputError
-from study.sweep.plan import Plan, make_plan
+from study.planning.plan import Plan, make_plan
 
 GRID_OPTIONS = ("heads", "fractions", "encoder_seeds", "policy_seeds", "reference", "baselines", "drive")
 

@@ -20,10 +20,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from study.birdview.targets import FRACTION_BITS, Floats, Moment, find_target, fixed_point, painted_sizes
 from study.config.heads import mask_heads
 from study.config.paper import IMAGE
 from study.config.settings import BirdviewSettings
-from study.data.targets import FRACTION_BITS, Floats, Moment, find_target, fixed_point, painted_sizes
 from study.episode.schema import CYCLIST, GREEN, PEDESTRIAN, RATE_HZ, VEHICLE, Episode, Lane
 from study.errors import BadInputError
 

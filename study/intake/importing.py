@@ -10,13 +10,13 @@ from dataclasses import asdict
 from pathlib import Path
 
 from study.atomic import atomic_folder
-from study.episode.adapt import Adapted, adapt
-from study.episode.examine import examine
 from study.episode.files import write_episode
 from study.episode.findings import Finding, Findings
-from study.episode.imported import SCHEMA_VERSION, Drive, Imported
 from study.episode.recording import Recording
 from study.errors import BadInputError
+from study.intake.adapt import Adapted, adapt
+from study.intake.examine import examine
+from study.intake.imported import SCHEMA_VERSION, Drive, Imported
 
 ADVICE = "; --check lists all findings without importing, --drop-bad leaves out what is bad"
 

@@ -9,9 +9,9 @@ import pandas as pd
 from scipy import optimize, special
 from scipy import stats as scipy_stats
 
-from study.analysis.drives import DriveScores
-from study.analysis.intervals import LEVEL, Crossed, Estimate, Sample, crossed, satterthwaite
-from study.analysis.learning_curves import Array
+from study.statistics.drives import DriveScores
+from study.statistics.intervals import LEVEL, Crossed, Estimate, Sample, crossed, satterthwaite
+from study.statistics.learning_curves import Array
 
 PAIRED, WELCH = "t, paired by seed", "Welch's t, two samples"
 

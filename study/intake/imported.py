@@ -1,6 +1,6 @@
 """Imported drives: Episodes of any writer, checked, adapted and kept together as a folder that a sweep can use.
 
-The folder holds one adapted Episode for each that was found (see `study.episode.importing`), and
+The folder holds one adapted Episode for each that was found (see `study.intake.importing`), and
 
 `import.json`   schema_version 1; drives: [{"name", "digest", "agents", "egos", "seconds", "derived", "skipped",
                 "recording"}]
@@ -26,7 +26,7 @@ SCHEMA_VERSION = 1
 
 @dataclass(frozen=True)
 class Drive:
-    """One imported drive; `derived` and `skipped` count moments of its egos, by command (see `study.episode.adapt`).
+    """One imported drive; `derived` and `skipped` count moments of its egos, by command (see `study.intake.adapt`).
 
     `recording`: name of what it was cut from, its own name where that was not cut.
     """

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from study.episode.adapt import SLOWEST_RATE
 from study.episode.findings import Findings
-from study.episode.motion import motion_faults
-from study.episode.places import check_places
 from study.episode.recording import Recording, read_recording
 from study.episode.rows import select
+from study.intake.adapt import SLOWEST_RATE
+from study.intake.motion import motion_faults
+from study.intake.places import check_places
 
 ROUNDS = 5  # what is left of an agent can be wrong again
 

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as Pillow
 
+from study.birdview.renderer import Renderer
+from study.birdview.scene import ENDINGS, GREEN, SIDE, WARNING, WORDS, Scene
 from study.config.settings import BirdviewSettings
-from study.data.birdview import Renderer
-from study.data.scene import ENDINGS, GREEN, SIDE, WARNING, WORDS, Scene
 from study.episode.schema import Episode
 from study.errors import BadInputError, one_of
 

@@ -10,15 +10,15 @@ from typing import Annotated, Literal
 
 from statsmodels.stats.multitest import multipletests
 
-from study.analysis import comparisons, intervals, learning_curves
-from study.analysis.drives import DriveScores, by_drive
-from study.analysis.intervals import Estimate, Sample
-from study.analysis.learning_curves import ACCURACY, DRIVING, Panel, Point
 from study.config.grid import Grid, Rules
 from study.config.heads import HEAD_SETS
 from study.config.settings import FromJson, Number
 from study.results.cell_result import CellResult
 from study.results.sweep_record import SweepRecord
+from study.statistics import comparisons, intervals, learning_curves
+from study.statistics.drives import DriveScores, by_drive
+from study.statistics.intervals import Estimate, Sample
+from study.statistics.learning_curves import ACCURACY, DRIVING, Panel, Point
 
 Unit = Literal["points", "loss", "epochs", "ratio", "score"]
 Interval = Annotated[Estimate, FromJson]  # the same value, that pydantic can read back from a report.json

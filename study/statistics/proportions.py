@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from statsmodels.stats.proportion import proportion_confint
 
-from study.analysis.intervals import LEVEL, Estimate
+from study.statistics.intervals import LEVEL, Estimate
 
 
 def wilson_interval(count: float, n: int, level: float = LEVEL) -> Estimate:

@@ -32,9 +32,9 @@ from scipy import special
 from scipy import stats as scipy_stats
 from statsmodels.stats.weightstats import DescrStatsW
 
-from study.analysis import drives as test_drives
-from study.analysis.drives import DriveScores
-from study.analysis.learning_curves import LAST, Array, by_encoder, encoders, panel
+from study.statistics import drives as test_drives
+from study.statistics.drives import DriveScores
+from study.statistics.learning_curves import LAST, Array, by_encoder, encoders, panel
 
 LEVEL = 0.95
 

@@ -18,8 +18,8 @@ from study.config.settings import StudySettings
 from study.config.workspace import HERE, Workspace
 from study.console.display import Display
 from study.data.prepare import drives_folder, frames_folder
-from study.episode.imported import Imported, open_import
 from study.errors import BadInputError
+from study.intake.imported import Imported, open_import
 from study.sim.dynamics import check_dynamics
 from study.stages import Cost, Work, cell_cost, data_cost
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.neighbors import KDTree
 
-from study.data.birdview import Moments
+from study.birdview.renderer import Moments
 from study.episode.schema import Episode, Lane
 
 SPACING = 2.0  # between points of a lane's centre line [m]

@@ -1,0 +1,1 @@
+"""The study's statistics, from tables of scores: curves, intervals, comparisons, effects."""
