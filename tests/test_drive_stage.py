@@ -18,12 +18,10 @@ from study.planning.plan import Plan, cell_jobs, make_plan
 from study.results.cell_result import CellResult
 from study.results.drives import EXPERT, WAY, means
 from study.stages import Flow
-from study.sweep.__main__ import main
 from study.tracking.driven import commit_drives
 from study.tracking.reader import Reader
 from study.tracking.tracker import Tracker
-from tests.support.processes import sweep
-from tests.support.sweeps import FOUR_CELLS, UndisturbedSweep
+from tests.support.sweeps import FOUR_CELLS, UndisturbedSweep, sweep_here
 
 
 @pytest.fixture(scope="module")
@@ -160,18 +158,16 @@ def test_a_finished_sweep_drives_when_it_is_told_to(
     undisturbed: UndisturbedSweep, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = undisturbed.copy(tmp_path / "work")
-    monkeypatch.chdir(folder)
-    words = (*FOUR_CELLS, "--heads", "rec", "--workers", "1")
-    without = sweep(folder, *words, "--no-report", "--drive", "false")
-    assert without.returncode == 0, without.stderr
-    assert "driving" not in without.stderr
-    assert main([*words, "--dry-run"]) == 0
+    words = (*FOUR_CELLS, "--heads", "rec", "--no-report")
+    assert sweep_here(folder, monkeypatch, *words, "--drive", "false") == 0
+    assert "driving" not in capsys.readouterr().err
+    assert sweep_here(folder, monkeypatch, *words, "--dry-run") == 0
     assert "1 of 1 cells to drive" in capsys.readouterr().out
-    driving = sweep(folder, *words, "--no-report")
-    assert driving.returncode == 0, driving.stderr
-    assert "encoder" not in driving.stderr
-    assert "driving: 0 of 1 cells" in driving.stderr
-    assert main(["status", *words]) == 0
+    assert sweep_here(folder, monkeypatch, *words) == 0
+    told = capsys.readouterr().err
+    assert "encoder" not in told
+    assert "driving: 0 of 1 cells" in told
+    assert sweep_here(folder, monkeypatch, "status", *FOUR_CELLS, "--heads", "rec") == 0
     status = capsys.readouterr().out
     assert "1 of 1 cells finished" in status
     assert "have driven" not in status

@@ -5,10 +5,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from pypdf import PdfReader
 
-from tests.support.processes import ROOT, sweep
-from tests.support.sweeps import working_folder
+from study.data.__main__ import main as import_drives
+from tests.support.processes import ROOT
+from tests.support.sweeps import TINY_SWEEP, sweep_here, working_folder
 
 EXAMPLE = ROOT / "examples/foreign_data.py"
 
@@ -17,13 +19,12 @@ def test_the_example_imports_nothing_of_the_program() -> None:
     assert not re.search(r"^\s*(from|import) study", EXAMPLE.read_text(), re.MULTILINE)
 
 
-def test_foreign_drives_end_in_a_report(tmp_path: Path) -> None:
+def test_foreign_drives_end_in_a_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     working_folder(tmp_path)
-    for command in ([str(EXAMPLE), "ring"], ["-m", "study.data", "import", "ring", "--out", "mine"]):
-        subprocess.run([sys.executable, *command], cwd=tmp_path, check=True, capture_output=True)
-    words = ("heads", "--profile", "tiny", "--policy_seeds", "2", "--heads", "[rec,full]", "--workers", "1")
-    words += ("--baselines", "[trail-pca,state]")
-    completed = sweep(tmp_path, *words, "--data", "mine")
-    assert completed.returncode == 0, completed.stderr
+    subprocess.run([sys.executable, EXAMPLE, "ring"], cwd=tmp_path, check=True, capture_output=True)
+    monkeypatch.chdir(tmp_path)
+    assert import_drives(["import", "ring", "--out", "mine"]) == 0
+    words = (*TINY_SWEEP, "--heads", "[rec,full]", "--baselines", "[trail-pca,state]")
+    assert sweep_here(tmp_path, monkeypatch, *words, "--data", "mine") == 0
     text = "".join(page.extract_text() for page in PdfReader(tmp_path / "reports/heads.pdf").pages)
     assert "foreign_data.py" in text

@@ -4,6 +4,7 @@ import json
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +15,13 @@ from pypdf import PdfReader
 from study.birdview.renderer import Renderer, valid_moments
 from study.config.grid import Grid
 from study.config.heads import HEAD_SETS, HEADS
+from study.config.modules import REGISTRIES
 from study.config.settings import BirdviewSettings
 from study.data.frames import unpack_masks
 from study.errors import BadInputError
 from tests.support.drives import crossing_drive
-from tests.support.processes import ROOT, sweep
-from tests.support.sweeps import working_folder
+from tests.support.processes import ROOT
+from tests.support.sweeps import TINY_SWEEP, sweep_here, working_folder
 
 TARGET = "examples.light_head:lights_ahead"
 
@@ -34,12 +36,22 @@ def test_a_further_mask_leaves_the_papers_as_they_are() -> None:
     assert 0 < unpack_masks(more_masks)[:, 2].mean() < 0.1
 
 
-def test_a_sweep_with_the_example_ends_with_its_report(tmp_path: Path) -> None:
+@pytest.fixture
+def _own_registries() -> Iterator[None]:
+    """Take the example's records out again."""
+    before = {name: dict(records) for name, records in REGISTRIES.items()}
+    yield
+    for name, records in before.items():
+        REGISTRIES[name].clear()
+        REGISTRIES[name].update(records)
+
+
+@pytest.mark.usefixtures("_own_registries")
+def test_a_sweep_with_the_example_ends_with_its_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     working_folder(tmp_path)
     shutil.copy(ROOT / "examples/light.yaml", tmp_path / "sweeps")
-    words = ("light", "--profile", "tiny", "--policy_seeds", "2", "--baselines", "[speed]")
-    completed = sweep(tmp_path, *words, "--heads", "[rec,rec+light]", "--workers", "1")
-    assert completed.returncode == 0, completed.stderr
+    words = ("light", *TINY_SWEEP[1:], "--baselines", "[speed]", "--heads", "[rec,rec+light]")
+    assert sweep_here(tmp_path, monkeypatch, *words) == 0
     report = [
         sys.executable,
         "-m",

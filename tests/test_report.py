@@ -110,11 +110,19 @@ def test_numbers_in_the_pdf_are_those_of_the_json(built):
         assert claim["outcome"] in text
 
 
-def test_the_first_page_says_how_far_the_scale_is_from_the_papers(built, tmp_path):
+@pytest.fixture(scope="module")
+def datasize(tmp_path_factory):
+    """Return a report of every fraction at the laptop's settings: the content of its file, and its PDF."""
+    folder = tmp_path_factory.mktemp("datasize")
+    pdf = build_report(simulate(DATASIZE_GRID, World(epochs=8), settings=load_profile("laptop")), folder)
+    return json.loads((folder / "datasize/report.json").read_text()), pdf
+
+
+def test_the_first_page_says_how_far_the_scale_is_from_the_papers(datasize):
     """Frames, images shown and steps, as shares of 400,000, 80 million and 39,200 at all the data."""
     settings = load_profile("laptop")
-    pdf = build_report(simulate(DATASIZE_GRID, World(epochs=8), settings=settings), tmp_path)
-    (first, *_), scale = pages(pdf), json.loads((tmp_path / "datasize" / "report.json").read_text())["scale"]
+    content, pdf = datasize
+    (first, *_), scale = pages(pdf), content["scale"]
     assert [row["fraction"] for row in scale] == [1.0, 0.5, 0.25, 0.125, 0.0625]
     assert (scale[0]["frames"], scale[0]["images"], scale[0]["steps"]) == (20_000, 240_000, 157 * 12)
     assert (scale[0]["paper_frames"], scale[0]["paper_images"], scale[0]["paper_steps"]) == (
@@ -253,9 +261,8 @@ def test_no_table_of_a_report_without_baselines_is_set_as_words():
     assert any(isinstance(block, Table) and block.caption.startswith("Final scores") for block in blocks)
 
 
-def test_the_datasize_report_has_its_claims(tmp_path):
-    build_report(simulate(DATASIZE_GRID, World(epochs=12)), tmp_path)
-    content = json.loads((tmp_path / "datasize" / "report.json").read_text())
+def test_the_datasize_report_has_its_claims(datasize):
+    content = datasize[0]
     assert [claim["claim"] for claim in content["claims"]] == ["D1", "D2", "D3", "D4"]
     assert content["figures"][0] == "datasize_convergespeed"
 

@@ -74,8 +74,8 @@ def test_a_failed_cell_is_reported_leaves_the_others_alone_and_runs_again_on_req
 
 
 @pytest.mark.stress
-@pytest.mark.parametrize("workers", ["1", "4"])
-def test_one_and_four_workers_give_the_table_of_two(undisturbed, tmp_path, workers):
+@pytest.mark.parametrize("workers", ["1", "2", "4"])
+def test_any_number_of_workers_gives_the_table_of_a_single_process(undisturbed, tmp_path, workers):
     undisturbed.copy(tmp_path)
     completed = sweep(tmp_path, *FOUR_CELLS, "--workers", workers, "--no-report")
     assert completed.returncode == 0, completed.stderr

@@ -90,7 +90,7 @@ def test_a_cell_that_another_process_trains_is_left_to_it(home, tmp_path, capsys
 
 
 def test_a_cell_that_fails_is_reported_and_the_others_go_on(home, tmp_path, capsys):
-    assert main([*PLAN, "--encoder.lr", "1e30", "--out", str(tmp_path)]) == EXIT_FAILED
+    assert main([*PLAN, "--encoder.lr", "1e30", "--threads", "2", "--out", str(tmp_path)]) == EXIT_FAILED
     message = capsys.readouterr().err
     assert "failed: rec 100% e0" in message
     assert "failed: full 100% e0" in message

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import datetime as dt
+import functools
 import hashlib
 import importlib.metadata
 import os
@@ -70,7 +71,7 @@ def provenance(root: Path = ROOT) -> dict[str, Any]:
         "diff": diff,
         "diff_digest": hashlib.sha256(diff.encode()).hexdigest() if diff else None,
         "lock": hashlib.sha256(lock.read_bytes()).hexdigest() if lock.is_file() else None,
-        "packages": packages(),
+        "packages": dict(packages(tuple(sys.path))),
         "python": platform.python_version(),
         "platform": f"{platform.system()} {platform.release()} {platform.machine()}",
         "cpu": cpu_lines("model name")[0],
@@ -83,10 +84,11 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def packages() -> dict[str, str]:
-    """Return the version of every installed distribution by name; of several, that which Python imports."""
+@functools.cache  # every stage of a cell asks
+def packages(path: tuple[str, ...]) -> dict[str, str]:
+    """Return the version of every distribution on a search path by name; of several, that which Python imports."""
     versions: dict[str, str] = {}
-    for dist in importlib.metadata.distributions():  # in the order of the search path
+    for dist in importlib.metadata.distributions(path=list(path)):  # in the order of the search path
         if dist.name:
             versions.setdefault(dist.name.lower().replace("_", "-"), dist.version)
     return dict(sorted(versions.items()))

@@ -8,8 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pandas as pd
+import pytest
 
-from tests.support.processes import ROOT, CommandProcess, sweep_command
+from study.engine.inline import InlineEngine
+from study.sweep import run
+from study.sweep.__main__ import main
+from study.tracking.reader import Reader
+from tests.support.processes import ROOT
 from tests.support.run_database import RunDatabase, run_database
 
 LOCKS = (".lock", ".in-use", ".mlflow.db.lock")  # stay, so that two processes never hold different files
@@ -25,7 +30,7 @@ driving: {drives: 2, unseen_towns: 0, duration: 1, baseline_policies: 2}
 """
 TINY_SWEEP = ("heads", "--profile", "tiny", "--policy_seeds", "2")
 FOUR_CELLS = (*TINY_SWEEP, "--baselines", "[]", "--workers", "2")
-SECONDS = 20.0  # of FOUR_CELLS on two idle cores, in memory
+SECONDS = 14.0  # of FOUR_CELLS without report on two idle cores, in memory
 
 
 def working_folder(folder: Path) -> Path:
@@ -51,8 +56,8 @@ class UndisturbedSweep:
             return cls(folder, float(slowdown.read_text()), empty_store)
         working_folder(folder)
         start = time.monotonic()
-        process = CommandProcess(folder, *sweep_command(*FOUR_CELLS))
-        assert process.wait() == 0, process.output
+        with pytest.MonkeyPatch.context() as monkeypatch:
+            assert sweep_here(folder, monkeypatch, *FOUR_CELLS, "--no-report") == 0
         assert len(run_database(folder).digests()) == 4
         assert leftovers(folder) == []
         slowdown.write_text(str(max(1.0, (time.monotonic() - start) / SECONDS)))
@@ -66,6 +71,13 @@ class UndisturbedSweep:
         (folder / "mlruns").mkdir()
         shutil.copy(self.empty_store, folder / "mlruns/mlflow.db")
         return folder
+
+
+def sweep_here(folder: Path, monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
+    """Run a sweep in this process, without Dask, which starts no further process; return its exit code."""
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(run, "start_engine", lambda *_: InlineEngine())
+    return main(words)
 
 
 def leftovers(folder: Path) -> list[str]:
@@ -85,7 +97,8 @@ def assert_same_outcome(folder: Path, undisturbed: Path, database: RunDatabase |
     doubled = "select run_uuid, key, step from metrics group by run_uuid, key, step having count(*) > 1"
     assert database.query("select run_uuid from runs where status = 'RUNNING'") == []
     assert database.query(doubled) == []
-    curves, expected = (pd.read_parquet(each / "reports/heads/curves.parquet") for each in (folder, undisturbed))
+    curves = pd.read_parquet(folder / "reports/heads/curves.parquet")
+    expected = Reader.look(f"sqlite:///{undisturbed}/mlruns/mlflow.db").read_sweep("heads").table(baselines=True)
     cells = curves[["heads", "encoder_seed"]].drop_duplicates()
     digests = database.digests()
     assert len(digests) == len(cells) >= 2
