@@ -189,6 +189,7 @@ def test_everything_can_go_and_frees_what_was_said(store, capsys):
     assert list((store.workspace.data / "frames").iterdir()) == []
 
 
+@pytest.mark.stress
 @pytest.mark.parametrize("interrupted", ["while the cache goes", "when the sweep is marked"])
 def test_a_cleaning_that_was_cut_short_is_finished_by_the_next(store, interrupted, monkeypatch):
     place = (cached_data, "_delete") if interrupted == "while the cache goes" else (Deletion, "_collect")

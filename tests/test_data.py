@@ -46,7 +46,7 @@ def contents(folder):
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-@pytest.mark.parametrize("workers", [2, 4])
+@pytest.mark.parametrize("workers", [2, pytest.param(4, marks=pytest.mark.stress)])
 def test_drives_and_frames_are_the_same_bytes_with_any_number_of_workers(settings, root, tmp_path, workers):
     """Recording, choosing and rendering by Dask's workers, against this process alone."""
     with local_engine(workers, tmp_path / "scratch") as engine:

@@ -4,6 +4,7 @@ import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import pandas as pd
@@ -28,8 +29,9 @@ from tests.support.synthetic_records import DATASIZE_GRID, HEADS_GRID, World, si
 SMALL = Grid(name="small", title="T", heads=("rec", "full"), policy_seeds=3, baselines=())
 
 
+@cache
 def pages(pdf):
-    """Return the words of each page, with single blanks."""
+    """Return the words of each page, with single blanks. No test writes a PDF again."""
     return [" ".join(page.extract_text().split()) for page in PdfReader(pdf).pages]
 
 

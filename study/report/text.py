@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -34,9 +34,9 @@ ROUNDINGS = (
 )
 
 
-def render(template: str, pictures: dict[str, str], **values: object) -> list[Block]:
-    """Return the document that a template makes of some values. `pictures`: the file of each figure that there is."""
-    # Not HTML: `plain` escapes what expressions give.
+@cache
+def _environment() -> Environment:
+    """Return what reads the templates, each once. They are not HTML: `plain` escapes what expressions give."""
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
         finalize=plain,
@@ -46,7 +46,12 @@ def render(template: str, pictures: dict[str, str], **values: object) -> list[Bl
     environment.filters |= {name: getattr(rounding, name) for name in (*ROUNDINGS, "thousands")}
     environment.filters |= {"code": code, "bold": bold, "inline": Inline, "counts": counts, "key_numbers": key_numbers}
     environment.globals |= {name: getattr(rounding, name) for name in ("UNITS", "between", *ROUNDINGS)}
-    return list(parse(environment.get_template(template).render(**values), pictures))
+    return environment
+
+
+def render(template: str, pictures: dict[str, str], **values: object) -> list[Block]:
+    """Return the document that a template makes of some values. `pictures`: the file of each figure that there is."""
+    return list(parse(_environment().get_template(template).render(**values), pictures))
 
 
 def document(report: Report) -> list[Block]:
