@@ -19,6 +19,8 @@ from study.statistics.learning_curves import Array
 
 TINY = np.finfo(np.float64).tiny
 
+Classes = NDArray[np.int64]
+
 
 def steering_floor(labels: Array) -> float:
     """Return the steering loss (smooth L1, Sec. III-B.3) of the best constant command: what a policy must beat."""
@@ -40,7 +42,7 @@ def macro_f1(predicted: NDArray[np.uint8], label: NDArray[np.uint8]) -> Array:
     return np.asarray(scores.reshape(len(predicted), -1).mean(axis=1))
 
 
-def _side_by_side(predicted: NDArray[np.uint8], label: NDArray[np.uint8]) -> tuple[Array, Array, Array]:
+def _side_by_side(predicted: NDArray[np.uint8], label: NDArray[np.uint8]) -> tuple[Classes, Classes, Classes]:
     """Return true and given classes with classes of its own for each seed: scikit-learn is called once for all."""
     own = len(ACCELERATIONS) * np.arange(len(predicted))[:, None]
     return (label + own).ravel(), (predicted + own).ravel(), np.arange(len(ACCELERATIONS) * len(predicted))
