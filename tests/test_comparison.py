@@ -4,9 +4,9 @@ import re
 import pytest
 
 from study.config.grid import Grid
+from study.document.markdown import markdown
 from study.errors import BadInputError
 from study.report.comparison import compare, difference
-from study.report.markdown import markdown
 from study.report.model import checked, read_report
 from study.report.rounding import percent
 from study.report.summary import summarise

@@ -8,9 +8,9 @@ import pytest
 from study.analysis.confounds import CONFOUNDS, concerned, contrasts, varied
 from study.config.files import load_grid
 from study.config.settings import StudySettings
+from study.document.markdown import markdown
 from study.planning.plan import make_plan
 from study.report.build import build_report
-from study.report.markdown import markdown
 from study.report.summary import summarise
 from study.report.text import document
 from study.statistics import comparisons

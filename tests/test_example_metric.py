@@ -8,9 +8,9 @@ from pypdf import PdfReader
 
 from examples.metric import MISSED_BRAKES, missed_brakes
 from study.analysis.metrics import METRICS
+from study.document.markdown import markdown
 from study.report.build import build_report
 from study.report.comparison import compare
-from study.report.markdown import markdown
 from study.report.model import read_report
 from tests.support.synthetic_records import HEADS_GRID, World, simulate
 

@@ -10,15 +10,15 @@ from PIL import Image
 from study.analysis.claims import OUTCOMES
 from study.config.grid import Grid
 from study.config.heads import HEAD_SETS
+from study.document.blocks import Picture
+from study.document.markdown import markdown
+from study.document.typesetting import rasterise
 from study.errors import BadInputError
 from study.figures import curves, differences, pictures, style
 from study.report.comparison import compare
-from study.report.document import Picture
 from study.report.drawings import draw, draw_sweeps
-from study.report.markdown import markdown
 from study.report.summary import summarise
 from study.report.text import document
-from study.report.typesetting import rasterise
 from study.statistics import intervals, learning_curves
 from tests.support.synthetic_records import DATASIZE_GRID, HEADS_GRID, World, simulate
 

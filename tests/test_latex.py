@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
+from study.document.blocks import Heading, Table, code, plain
+from study.document.latex import inline, latex
+from study.document.markdown import markdown
 from study.report import __main__
 from study.report.comparison import compare
-from study.report.document import Heading, Table, code, plain
-from study.report.latex import inline, latex
-from study.report.markdown import markdown
 from study.report.model import read_report
 from study.report.text import document
 from tests.support.processes import ROOT

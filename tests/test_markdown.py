@@ -7,8 +7,8 @@ from pypdf import PdfReader
 
 from study.config.grid import Grid
 from study.config.settings import StudySettings
+from study.document.markdown import markdown
 from study.report.build import build_report
-from study.report.markdown import markdown
 from study.report.rounding import between, epochs, fixed, percent, points
 from study.report.summary import summarise
 from study.report.text import document

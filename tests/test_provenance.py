@@ -12,8 +12,8 @@ import pytest
 
 from study.compute.provenance import DIFF_LIMIT, ROOT, cores, provenance, warn_of_unknown_origin
 from study.config.grid import Grid
-from study.report.document import plain
-from study.report.markdown import markdown
+from study.document.blocks import plain
+from study.document.markdown import markdown
 from study.report.summary import summarise
 from study.report.text import document
 from study.tracking.metrics import known

@@ -13,12 +13,12 @@ from pypdf import PdfReader
 
 from study.config.files import load_profile
 from study.config.grid import Grid, Rules
+from study.document.blocks import Paragraph, Table
+from study.document.markdown import markdown
 from study.errors import BadInputError
 from study.figures.fonts import Fonts, fonts_for
 from study.report import __main__, build
 from study.report.build import build_report
-from study.report.document import Paragraph, Table
-from study.report.markdown import markdown
 from study.report.model import read_report
 from study.report.scale import training_scale
 from study.report.summary import summarise

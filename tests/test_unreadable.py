@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from study.config.grid import Grid
+from study.document.markdown import markdown
 from study.errors import BadInputError
 from study.report.__main__ import main
 from study.report.build import complete_cells, publish
-from study.report.markdown import markdown
 from study.report.model import read_report
 from study.report.summary import summarise
 from study.report.text import document

@@ -9,18 +9,18 @@ from pathlib import Path
 
 from study.atomic import write_atomic
 from study.config.workspace import HERE
+from study.document.blocks import Block
+from study.document.latex import latex
+from study.document.markdown import markdown
+from study.document.typesetting import rasterise, typeset
 from study.errors import EXIT_FAILED, BadInputError, masked
 from study.figures.fonts import fonts_for, lettering
 from study.figures.style import METADATA, paint, write
 from study.report.comparison import compare
-from study.report.document import Block
 from study.report.drawings import draw, draw_sweeps
-from study.report.latex import latex
-from study.report.markdown import markdown
 from study.report.model import Report, read_report
 from study.report.summary import summarise
 from study.report.text import document
-from study.report.typesetting import rasterise, typeset
 from study.results.sweep_record import SweepRecord
 from study.tracking.reader import Reader
 from study.tracking.tracker import Tracker

@@ -16,7 +16,7 @@ from study.analysis.claims import Verdict
 from study.analysis.metrics import Metric
 from study.config.baselines import BASELINES
 from study.config.grid import Cell
-from study.report.document import Block, Inline, bold, code, italic, lines, plain, table
+from study.document.blocks import Block, Inline, bold, code, italic, lines, plain, table
 from study.report.driving import EXPERT
 from study.report.model import Report, Score, Spread
 from study.report.rounding import NOTHING, UNITS, between, epochs, fixed, interval, percent, show

@@ -12,9 +12,9 @@ from study.analysis import driving
 from study.analysis.driving import ENDS, PER_KM, RATES, SCORES
 from study.analysis.metrics import Metric
 from study.config.baselines import BASELINES
+from study.document.blocks import Inline, italic, plain, table
 from study.figures import driving as figures
 from study.figures.style import Drawing
-from study.report.document import Inline, italic, plain, table
 from study.report.model import Driving, DrivingPlace, DrivingScore, Spread
 from study.report.rounding import fixed, interval, show
 from study.report.spread import spread, spread_of

@@ -13,8 +13,8 @@ from study.analysis.claims import Verdict
 from study.analysis.metrics import Metric
 from study.config.baselines import BASELINES
 from study.config.heads import HEAD_SETS
+from study.document.blocks import Block, Inline, bold, code, italic, parse, plain, table
 from study.report import driving, rounding
-from study.report.document import Block, Inline, bold, code, italic, parse, plain, table
 from study.report.model import Report, Score, Spread
 from study.report.rounding import LOSS, NOTHING, UNITS, interval, percent, show, thousands
 from study.statistics.learning_curves import KEYFRAME

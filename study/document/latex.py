@@ -11,7 +11,7 @@ import re
 import unicodedata
 from collections.abc import Iterable, Sequence
 
-from study.report.document import Block, Heading, Table
+from study.document.blocks import Block, Heading, Table
 
 LONG = 36  # characters beyond which the words of a column are wrapped
 LINE = 84  # characters of \small on a line of the article class

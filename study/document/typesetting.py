@@ -9,10 +9,10 @@ from pathlib import Path, PurePosixPath
 
 import typst
 
+from study.document.blocks import Block
 from study.figures.style import DOTS
-from study.report.document import Block
 
-TEMPLATE = Path(__file__).with_name("report.typ")
+TEMPLATE = Path(__file__).with_name("document.typ")
 
 
 def typeset(

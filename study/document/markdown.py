@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from urllib.parse import quote
 
-from study.report.document import Block, Heading, Paragraph, Picture, Table
+from study.document.blocks import Block, Heading, Paragraph, Picture, Table
 
 MARKS = {"l": "---", "c": ":-:", "r": "--:"}
 
