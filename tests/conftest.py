@@ -8,6 +8,7 @@ import signal
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from filelock import FileLock
@@ -38,13 +39,9 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # a hundred programs start: eac
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ["OMP_NUM_THREADS"] = "1"
 
-# After the environment is set: these modules load the study, and that loads matplotlib and MLflow.
-from study.config.settings import BirdviewSettings, FramesSettings  # noqa: E402
-from study.data.build import frames_flow  # noqa: E402
-from study.engine.flows import run_flow  # noqa: E402
-from study.tracking.experiment import create_database  # noqa: E402
-from tests.support.drives import write_drives  # noqa: E402
-from tests.support.sweeps import UndisturbedSweep  # noqa: E402
+# The study loads matplotlib and MLflow, which takes seconds: each fixture imports what it needs, after this is set.
+if TYPE_CHECKING:
+    from tests.support.sweeps import UndisturbedSweep
 
 
 def pytest_unconfigure() -> None:
@@ -66,6 +63,8 @@ def _working_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 @pytest.fixture(scope="session")
 def small_drives(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Return three drives for encoders, then three for policies."""
+    from tests.support.drives import write_drives
+
     folder = tmp_path_factory.mktemp("drives")
     return write_drives(folder / "a", 3) + write_drives(folder / "b", 3, first_seed=10)
 
@@ -73,6 +72,10 @@ def small_drives(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 @pytest.fixture(scope="session")
 def small_store(small_drives: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the folder of a frame store of those drives; cards and previews may be written there."""
+    from study.config.settings import BirdviewSettings, FramesSettings
+    from study.data.build import frames_flow
+    from study.engine.flows import run_flow
+
     folder = tmp_path_factory.mktemp("frames") / "store"
     settings = FramesSettings(encoder=60, policy=40)
     run_flow(frames_flow(settings, BirdviewSettings(), small_drives[:3], small_drives[3:], folder))
@@ -82,6 +85,8 @@ def small_store(small_drives: list[Path], tmp_path_factory: pytest.TempPathFacto
 @pytest.fixture(scope="session")
 def empty_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a database file with MLflow's empty tables: making them takes seconds, copying the file nothing."""
+    from study.tracking.experiment import create_database
+
     path = tmp_path_factory.mktemp("empty") / "mlflow.db"
     create_database(path)
     return path
@@ -90,6 +95,8 @@ def empty_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def undisturbed(empty_store: Path, tmp_path_factory: pytest.TempPathFactory) -> UndisturbedSweep:
     """Return a finished sweep of four cells, to copy and to compare with; processes that test side by side share it."""
+    from tests.support.sweeps import UndisturbedSweep
+
     base = tmp_path_factory.getbasetemp()
     folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "undisturbed"
     with FileLock(f"{folder}.lock"):
