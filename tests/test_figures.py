@@ -14,7 +14,7 @@ from study.document.blocks import Picture
 from study.document.markdown import markdown
 from study.document.typesetting import rasterise
 from study.errors import BadInputError
-from study.figures import curves, differences, pictures, style
+from study.figures import curves, differences, driving, pictures, style
 from study.report.comparison import compare
 from study.report.drawings import draw, draw_sweeps
 from study.report.summary import summarise
@@ -135,6 +135,15 @@ def test_typst_paints_svg_pictures_as_matplotlib_does(heads_figure, bands):
         ours, theirs = (cv2.blur(picture, (9, 9)) for picture in (ours, theirs))  # edges are smoothed differently
         assert np.abs(ours - theirs).mean() < 0.2 * np.abs(theirs - 255).mean()
     assert rasterise({}) == {}
+
+
+def test_an_interval_of_few_drives_does_not_stretch_the_axis_of_driving_scores():
+    (axes,) = driving.scores([("rec", "rec", 40.0, 30.0, 50.0), ("full", "full", 60.0, -22_000.0, 22_000.0)]).axes
+    low, high = axes.get_xlim()
+    assert -5 < low < 0
+    assert 100 < high < 110
+    ends = [path.vertices[:, 0].tolist() for lines in axes.collections for path in lines.get_paths()]
+    assert ends == [[30, 50], [0, 100]]
 
 
 def test_a_figure_is_written_atomically_in_the_format_of_its_ending(tmp_path):

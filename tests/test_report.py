@@ -381,6 +381,12 @@ def test_format_md_prints_tables_and_writes_nothing(tracker, committed, tmp_path
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_folder_for_what_is_printed_is_refused(tracker, committed, tmp_path):
+    words = ["pair", "--format", "md", "--out", str(tmp_path), "--tracking", tracker.experiment.uri]
+    with pytest.raises(BadInputError, match="goes with --format pdf; md is printed"):
+        __main__.main(words)
+
+
 def test_a_sweep_that_was_never_run_is_bad_input(tracker, tmp_path):
     with pytest.raises(BadInputError, match="no sweep 'heads'"):
         build.publish(tracker, "heads", None, tmp_path)

@@ -46,7 +46,8 @@ def explain(error: ValidationError, source: str) -> BadInputError:
             lines.append(f"unknown setting '{where}'")
             continue
         message = item["msg"].removeprefix("Value error, ")
-        got = "" if isinstance(item["input"], dict) else f" (got {item['input']!r})"
+        whole = isinstance(item["input"], dict) and not item["type"].endswith("_type")  # a group of settings
+        got = "" if whole else f" (got {item['input']!r})"
         lines.append(f"{where}: {message}{got}" if where else message)
     return BadInputError(f"{source}: " + "; ".join(lines))
 

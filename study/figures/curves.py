@@ -220,6 +220,7 @@ def encoder_losses(lines: Sequence[tuple[str, str, float, pd.Series]], constants
                 alpha=0.45 if pale else 1,
                 markevery=max(len(values) // 8, 1),
             )
+        axes.locator_params(axis="x", integer=True)
         axes.axhline(constant, color=GREY, linewidth=0.8, linestyle="--")
         axes.set(yscale="log", title=literal(head), xlabel="encoder epoch")
     panels[0].set_ylabel("loss to reduce, test")

@@ -21,13 +21,16 @@ CROSS = "x"  # of baselines, which have no marker of their own
 
 @mpl.rc_context(STYLE)
 def scores(rows: Sequence[tuple[str, str, float, float, float]]) -> Figure:
-    """Draw driving scores, 0 to 100: a row's label, its head set or baseline, mean and ends of the 95 % interval."""
+    """Draw driving scores, 0 to 100: a row's label, its head set or baseline, mean and ends of the 95 % interval.
+
+    Intervals of a few drives may end beyond what a score can be; they are cut there.
+    """
     figure, (axes,) = new_figure(0.7 + 0.22 * len(rows))
     for place, (_, heads, mean, low, high) in enumerate(rows):
         colour, marker = _mark(heads)
-        axes.hlines(place, low, high, color=colour, linewidth=2.2, alpha=0.6)
+        axes.hlines(place, max(low, 0), min(high, 100), color=colour, linewidth=2.2, alpha=0.6)
         axes.plot([mean], [place], marker, color=colour, markersize=4)
-        end = mean if np.isnan(high) else max(high, mean)
+        end = mean if np.isnan(high) else min(max(high, mean), 100)
         axes.annotate(
             f"{mean:.1f}".replace("-", "\N{MINUS SIGN}"),
             (end, place),
@@ -37,9 +40,8 @@ def scores(rows: Sequence[tuple[str, str, float, float, float]]) -> Figure:
             fontsize=6.5,
             color=GREY,
         )
-    left = min([0.0, *(low - 1 for _, _, _, low, _ in rows if low < 0)])
     axes.set_yticks(range(len(rows)), [literal(row[0]) for row in rows])
-    axes.set(ylim=(len(rows) - 0.4, -0.6), xlim=(left, 105), xlabel="driving score [0 to 100]")
+    axes.set(ylim=(len(rows) - 0.4, -0.6), xlim=(-1, 108), xlabel="driving score [0 to 100]")
     axes.spines["left"].set_visible(False)
     axes.tick_params(axis="y", length=0)
     axes.grid(axis="x", color=GREY, alpha=0.2, linewidth=0.4)

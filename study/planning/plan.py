@@ -131,7 +131,7 @@ def _given(grid: dict[str, Any], study: dict[str, Any]) -> Iterator[str]:
         if isinstance(value, list):
             yield f"[{','.join(map(str, value))}]"
         else:
-            yield json.dumps(value) if isinstance(value, dict) else str(value)
+            yield json.dumps(value) if isinstance(value, dict | bool) else str(value)
 
 
 def look_up(tracking: str) -> Reader | None:

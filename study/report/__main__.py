@@ -17,6 +17,7 @@ import click
 
 from study.config.workspace import HERE
 from study.console.options import invoke, run, tracking_option
+from study.errors import BadInputError
 
 HINT = (
     "settings and options of a run go with python -m study.sweep: a report takes the sweep's name and, with --profile, "
@@ -28,9 +29,9 @@ HINT = (
 @click.argument("name", metavar="SWEEP")
 @click.option("--profile", metavar="P", help="of the sweep [that of its latest run]")
 @click.option("--format", "kind", type=click.Choice(["pdf", "md", "latex"]), default="pdf", show_default=True)
-@click.option("--out", type=Path, default=HERE.reports, metavar="DIR", show_default=True)
+@click.option("--out", type=Path, metavar="DIR", help=f"of the PDF and what belongs to it [{HERE.reports}]")
 @tracking_option()
-def report(name: str, profile: str | None, kind: str, out: Path, tracking: str) -> int:
+def report(name: str, profile: str | None, kind: str, out: Path | None, tracking: str) -> int:
     """Write the report of SWEEP from what MLflow holds: PDF, figures, numbers and the tidy table.
 
     SWEEP: its name, for the latest run of that name, or the first six or more characters of a run id, which
@@ -39,13 +40,15 @@ def report(name: str, profile: str | None, kind: str, out: Path, tracking: str) 
     With --format md, print the report without figures as Markdown; with --format latex, its tables for a paper. Exit
     code 1: the result of a finished cell is lost.
     """
+    if kind != "pdf" and out:
+        raise BadInputError(f"--out {out} goes with --format pdf; {kind} is printed: leave --out away, and use > FILE")
     reader = resolve_name("study.tracking.reader:Reader").existing(tracking)
     if kind != "pdf":
         text, code = resolve_name("study.report.build:report_as_text")(reader, name, profile, kind)
         print(text, end="")
     else:
         tracker = resolve_name("study.tracking.tracker:Tracker")(tracking)  # the report becomes part of the run
-        pdf, code = resolve_name("study.report.build:publish")(tracker, name, profile, out)
+        pdf, code = resolve_name("study.report.build:publish")(tracker, name, profile, out or HERE.reports)
         print(pdf)
     return int(code)
 

@@ -12,7 +12,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from study.analysis.claims import Verdict
 from study.analysis.metrics import Metric
 from study.config.baselines import BASELINES
-from study.config.heads import HEAD_SETS
+from study.config.heads import HEAD_SETS, HEADS
 from study.document.blocks import Block, Inline, bold, code, italic, parse, plain, table
 from study.report import driving, rounding
 from study.report.model import Report, Score, Spread
@@ -89,6 +89,7 @@ def _lists(report: Report) -> dict[str, Any]:
     )
     main = [metric for metric in report.metrics if metric.guess]
     further = [metric for metric in report.metrics if not metric.guess]
+    squared = [head for head in report.parameters if head in HEADS and HEADS[head].loss == "squared-error"]
     return {
         "head_sets": ", ".join(
             f"{name} ({HEAD_SETS[name].word})" if name in HEAD_SETS else name for name in sweep.heads
@@ -96,6 +97,7 @@ def _lists(report: Report) -> dict[str, Any]:
         "head_parameters": ", ".join(
             f"{thousands(count)} ({head})" for head, count in report.parameters.items() if head != "encoder"
         ),
+        "squared": f" (squared error for {', '.join(squared)})" if squared else "",
         "wheel": _driving(report),
         "hundredths": partial(percent, digits=2),
         "fractions": ", ".join(f"{round(100 * fraction, 2):g} %" for fraction in sweep.fractions),

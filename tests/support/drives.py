@@ -151,5 +151,5 @@ def bird_view(
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.bool_]]:
     """Return one moment as image [64, 64, 3] uint8 and the masks pred and plan, [64, 64] bool."""
     images, masks = Renderer(episode, settings).render(np.array([[step, agent]]))
-    pred, plan = unpack_masks(masks[0]).astype(bool)
+    pred, plan = unpack_masks(masks[0]).astype(bool)[:2]
     return images[0], pred, plan
