@@ -1,4 +1,4 @@
-"""Typst sets the document, and paints its pictures for who cannot show SVG."""
+"""Typst sets the document as a PDF, and turns its pictures into PNG for viewers that cannot show SVG."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def rasterise(pictures: dict[str, bytes]) -> dict[str, bytes]:
         return {}
     pages = "#pagebreak()".join(f"#image({json.dumps(name)})" for name in pictures)
     source = f"#set page(width: auto, height: auto, margin: 0pt)\n{pages}"
-    # As above. One page is no list.
+    # The stub lacks files by name here, too. A single page comes as bytes, several as a list.
     painted = typst.compile({"main.typ": source.encode(), **pictures}, format="png", ppi=DOTS, ignore_system_fonts=True)  # type: ignore[call-overload]
     images: list[bytes] = painted if isinstance(painted, list) else [painted]
     return {str(PurePosixPath(name).with_suffix(".png")): image for name, image in zip(pictures, images, strict=True)}

@@ -30,7 +30,7 @@ driving: {drives: 2, unseen_towns: 0, duration: 1, baseline_policies: 2}
 """
 TINY_SWEEP = ("heads", "--profile", "tiny", "--policy_seeds", "2")
 FOUR_CELLS = (*TINY_SWEEP, "--baselines", "[]", "--workers", "2")
-SECONDS = 14.0  # of FOUR_CELLS without report on two idle cores, in memory
+SECONDS = 14.0  # of FOUR_CELLS in one process, without report, on an idle machine, in memory
 
 
 def working_folder(folder: Path) -> Path:
